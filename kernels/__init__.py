@@ -1,0 +1,1 @@
+"""Warp kernels: imports, constants, structs, funcs and kernels only. Host code is in ``warp_dvct.passes``."""

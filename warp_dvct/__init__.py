@@ -1,0 +1,1 @@
+"""Insert synthetic objects into real scenes with physically convincing light."""

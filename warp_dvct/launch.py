@@ -1,0 +1,165 @@
+"""Where kernels run: device choice, slabs over CPU threads, timing scopes and memory accounting.
+
+This is the only caller of ``wp.launch``. A Warp launch on the CPU runs on one thread, so :meth:`Launcher.launch` cuts
+the index range into slabs and hands them to a pool. Kernels therefore take ``first: int`` as their first argument and
+work on element ``first + wp.tid()``; each writes only what that element owns, so results do not depend on the slabs.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+import weakref
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_dvct.errors import DeviceError, OptionError
+
+SLABS_PER_THREAD = 8  # enough that an uneven slab does not leave the other threads idle
+MIN_SLAB = 256  # below this the 30 us of a launch outweigh the work
+
+
+class Launcher:
+    """Launches kernels on one device and keeps the books: seconds per pass, compile seconds, peak bytes.
+
+    Args:
+        device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
+        threads: CPU threads for slab launches; None for all cores that this process may use. Ignored on CUDA.
+    Raises:
+        DeviceError: The device is not present.
+        OptionError: ``threads`` is below 1.
+    """
+
+    def __init__(self, device: str = "cpu", threads: int | None = None) -> None:
+        self.device = find_device(device)
+        if threads is not None and threads < 1:
+            raise OptionError(f"threads is {threads}; give a number of at least 1")
+        self.threads = 1 if self.device.is_cuda else (threads or len(os.sched_getaffinity(0)))
+        self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
+        self.pass_seconds: dict[str, float] = {}
+        self.compile_seconds = 0.0
+        self.live_bytes = 0
+        self.peak_bytes = 0
+        self._scopes: list[list[Any]] = []
+        self._loaded: set[tuple[int, str]] = set()
+
+    def launch(self, kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:
+        """Run ``kernel`` for elements 0 … count - 1; its first argument, the slab's start, is supplied here."""
+        if count <= 0:
+            return
+        self.load(kernel.module)
+        slab = count
+        if self._pool is not None:
+            slab = max(MIN_SLAB, -(-count // (self.threads * SLABS_PER_THREAD)))
+        if slab >= count:
+            self._launch_slab(kernel, 0, count, inputs, outputs)
+            return
+        starts = range(0, count, slab)
+        assert self._pool is not None
+        list(self._pool.map(lambda a: self._launch_slab(kernel, a, min(slab, count - a), inputs, outputs), starts))
+
+    def launch_serial(self, kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:
+        """As :meth:`launch`, on one CPU thread: for kernels whose elements share a target."""
+        if count > 0:
+            self.load(kernel.module)
+            self._launch_slab(kernel, 0, count, inputs, outputs)
+
+    def _launch_slab(self, kernel, first, count, inputs, outputs) -> None:
+        wp.launch(kernel, dim=count, inputs=[first, *inputs], outputs=list(outputs), device=self.device)
+
+    def load(self, module: Any) -> None:
+        """Compile and load a module once; its time goes to ``compile_seconds``, not to the pass that runs it."""
+        key = (id(module), self.device.alias)
+        if key in self._loaded:
+            return
+        start = time.perf_counter()
+        quiet, wp.config.quiet = wp.config.quiet, True
+        try:
+            module.load(self.device)
+        finally:
+            wp.config.quiet = quiet
+        spent = time.perf_counter() - start
+        self.compile_seconds += spent
+        for scope in self._scopes:
+            scope[1] += spent
+        self._loaded.add(key)
+
+    @contextmanager
+    def scope(self, name: str) -> Iterator[None]:
+        """Add the time spent inside to ``pass_seconds[name]``, without compilation; nested scopes count on their own.
+
+        Running out of memory inside raises DeviceError with the pass's name.
+        """
+        scope = [name, 0.0]
+        self._scopes.append(scope)
+        start = time.perf_counter()
+        try:
+            yield
+            wp.synchronize_device(self.device)
+        finally:
+            self._scopes.pop()
+            spent = time.perf_counter() - start - scope[1]
+            self.pass_seconds[name] = self.pass_seconds.get(name, 0.0) + spent
+            for outer in self._scopes:
+                outer[1] += spent
+
+    def reset_times(self) -> None:
+        """Forget the seconds per pass (not the compile seconds), as before a new frame."""
+        self.pass_seconds = {}
+
+    def empty(self, shape: int | tuple[int, ...], dtype: Any) -> wp.array:
+        """An uninitialised device array, counted in ``peak_bytes``."""
+        return self._counted(lambda: wp.empty(shape, dtype=dtype, device=self.device), shape, dtype)
+
+    def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> wp.array:
+        """A zeroed device array, counted in ``peak_bytes``."""
+        return self._counted(lambda: wp.zeros(shape, dtype=dtype, device=self.device), shape, dtype)
+
+    def full(self, shape: int | tuple[int, ...], value: Any, dtype: Any) -> wp.array:
+        """A device array filled with ``value``, counted in ``peak_bytes``."""
+        return self._counted(lambda: wp.full(shape, value, dtype=dtype, device=self.device), shape, dtype)
+
+    def array(self, values: np.ndarray, dtype: Any) -> wp.array:
+        """Copy host values to the device, counted in ``peak_bytes``; the copy never aliases ``values``."""
+        values = np.ascontiguousarray(values)
+        return self._counted(lambda: wp.array(values, dtype=dtype, device=self.device, copy=True), values.shape, dtype)
+
+    def _counted(self, make, shape, dtype) -> wp.array:
+        try:
+            array = make()
+        except (MemoryError, RuntimeError) as error:
+            size = int(np.prod(shape)) * wp.types.type_size_in_bytes(dtype)
+            where = self._scopes[-1][0] if self._scopes else "loading the scene"
+            raise DeviceError(
+                f"out of memory in pass '{where}': {size / 2**20:.0f} MiB more were asked for on {self.device.alias} with"
+                f" {self.live_bytes / 2**20:.0f} MiB in use; lower --set volume.resolution or --imageWidth ({error})"
+            ) from error
+        size = array.capacity
+        self.live_bytes += size
+        self.peak_bytes = max(self.peak_bytes, self.live_bytes)
+        weakref.finalize(array, self._release, size)
+        return array
+
+    def _release(self, size: int) -> None:
+        self.live_bytes -= size
+
+
+def find_device(name: str) -> Any:
+    """The Warp device of that name.
+
+    Raises:
+        DeviceError: It is not present; the message lists what is.
+    """
+    wp.config.quiet = True
+    wp.init()
+    present = [d.alias for d in wp.get_devices()]
+    if name == "cuda" and wp.is_cuda_available():
+        return wp.get_preferred_device()
+    if name not in present:
+        raise DeviceError(f"device '{name}' is not present; present: {', '.join(present)}")
+    return wp.get_device(name)
