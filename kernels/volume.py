@@ -1,0 +1,121 @@
+"""The sparse volume: a pyramid of brick maps whose voxels hold six directional faces.
+
+A level of ``n`` voxels an edge is a table of bricks of 8^3 cells; a cell holds the index of a *record* or -1, so memory
+follows occupied voxels. A record has six faces, one per outward axis direction (+x, -x, +y, -y, +z, -z). A face holds
+two solutions, before (real surfaces) and after (all surfaces), each as (radiosity * alpha, alpha), where alpha is the
+front-facing area projected onto the face over the face's area, clamped to 1.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+BRICK = wp.constant(8)
+BRICK_CELLS = wp.constant(512)
+BEFORE = wp.constant(0)
+AFTER = wp.constant(1)
+
+
+@wp.struct
+class Volume:
+    low: wp.vec3  # corner of the box, in volume space
+    voxel: wp.float32  # edge of a level-0 voxel
+    n: wp.int32  # level-0 voxels an edge
+    levels: wp.int32
+    table_start: wp.array(dtype=wp.int32)  # [levels], where a level's brick table begins
+    tables: wp.array(dtype=wp.int32)  # brick index or -1
+    cells: wp.array(dtype=wp.int32)  # [bricks * 512], record index or -1
+    field: wp.array(dtype=wp.vec4)  # [records * 12], (record * 6 + face) * 2 + solution
+
+
+@wp.func
+def level_extent(n: int, level: int) -> int:
+    """Voxels an edge at a level; odd sizes round up."""
+    return ((n - 1) >> level) + 1
+
+
+@wp.func
+def brick_extent(n: int, level: int) -> int:
+    return (level_extent(n, level) + BRICK - 1) / BRICK
+
+
+@wp.func
+def cell_key(x: int, y: int, z: int, bricks: int) -> int:
+    """Sort key of a voxel: its brick's linear index, then its cell in the brick. Fits 30 bits up to 1024^3."""
+    brick = ((z / BRICK) * bricks + y / BRICK) * bricks + x / BRICK
+    return brick * BRICK_CELLS + ((z & 7) * BRICK + (y & 7)) * BRICK + (x & 7)
+
+
+@wp.func
+def key_cell(key: int, bricks: int) -> wp.vec3i:
+    """Inverse of ``cell_key``."""
+    brick = key / BRICK_CELLS
+    cell = key & 511
+    bx = brick % bricks
+    by = (brick / bricks) % bricks
+    bz = brick / (bricks * bricks)
+    return wp.vec3i(bx * BRICK + (cell & 7), by * BRICK + ((cell >> 3) & 7), bz * BRICK + (cell >> 6))
+
+
+@wp.func
+def find_record(volume: Volume, level: int, x: int, y: int, z: int) -> int:
+    """Record of a voxel, or -1 where it is empty or outside of the box."""
+    extent = level_extent(volume.n, level)
+    if x < 0 or y < 0 or z < 0 or x >= extent or y >= extent or z >= extent:
+        return -1
+    bricks = (extent + BRICK - 1) / BRICK
+    brick = volume.tables[volume.table_start[level] + ((z / BRICK) * bricks + y / BRICK) * bricks + x / BRICK]
+    if brick < 0:
+        return -1
+    return volume.cells[brick * BRICK_CELLS + ((z & 7) * BRICK + (y & 7)) * BRICK + (x & 7)]
+
+
+@wp.func
+def inside_volume(volume: Volume, position: wp.vec3) -> bool:
+    local = position - volume.low
+    edge = volume.voxel * float(volume.n)
+    return (
+        local[0] >= 0.0 and local[1] >= 0.0 and local[2] >= 0.0 and local[0] < edge and local[1] < edge and local[2] < edge
+    )
+
+
+@wp.func
+def face_of(axis: int, direction: float) -> int:
+    """Face whose outward normal is along ``axis`` with the sign of ``direction``."""
+    return wp.where(direction >= 0.0, 2 * axis, 2 * axis + 1)
+
+
+@wp.func
+def face_weight(normal: wp.vec3, face: int) -> float:
+    """How much a surface of that normal shows on a face: max(0, n . e)."""
+    along = normal[face / 2]
+    return wp.max(0.0, wp.where((face & 1) == 0, along, -along))
+
+
+@wp.func
+def surface_field(volume: Volume, position: wp.vec3, normal: wp.vec3, solution: int) -> wp.vec4:
+    """Radiosity of the surface at a point: trilinear over level-0 voxels, faces weighted by the surface's normal.
+
+    Returns the weighted sums (radiosity * alpha, alpha); the radiosity is their ratio. All zero where no voxel near
+    holds a surface of that orientation.
+    """
+    local = (position - volume.low) / volume.voxel - wp.vec3(0.5, 0.5, 0.5)
+    x0 = int(wp.floor(local[0]))
+    y0 = int(wp.floor(local[1]))
+    z0 = int(wp.floor(local[2]))
+    fx = local[0] - float(x0)
+    fy = local[1] - float(y0)
+    fz = local[2] - float(z0)
+    total = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    for corner in range(8):
+        dx = corner & 1
+        dy = (corner >> 1) & 1
+        dz = corner >> 2
+        record = find_record(volume, 0, x0 + dx, y0 + dy, z0 + dz)
+        if record >= 0:
+            weight = wp.where(dx == 1, fx, 1.0 - fx) * wp.where(dy == 1, fy, 1.0 - fy) * wp.where(dz == 1, fz, 1.0 - fz)
+            for axis in range(3):
+                along = normal[axis]
+                face = face_of(axis, along)
+                total += (weight * wp.abs(along)) * volume.field[(record * 6 + face) * 2 + solution]
+    return total

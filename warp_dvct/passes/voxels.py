@@ -1,0 +1,216 @@
+"""Sparse voxelization of real and synthetic surfaces into the level-0 records and the brick maps of all levels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_dvct.kernels import voxelization as kernels
+from warp_dvct.kernels.volume import Volume
+from warp_dvct.launch import Launcher
+
+
+@dataclass(frozen=True)
+class Box:
+    """A cube of voxels in volume space.
+
+    Attributes:
+        low: Its lowest corner.
+        edge: Its edge length.
+        n: Voxels an edge at level 0.
+    """
+
+    low: tuple[float, float, float]
+    edge: float
+    n: int
+
+    @property
+    def voxel(self) -> float:
+        """Edge of a voxel."""
+        return self.edge / self.n
+
+
+@dataclass(frozen=True)
+class Fragments:
+    """Pieces of triangles, one per (triangle, voxel), ordered by voxel through ``order``.
+
+    Attributes:
+        triangle: int ``[f]``. place: vec4 ``[f]``, centroid and area in voxel faces (level 0).
+        order: int ``[f]``, fragments sorted by voxel. record_start: int ``[records]``, first entry in ``order``.
+        count: Valid entries of ``order``.
+    """
+
+    triangle: Any
+    place: Any
+    order: Any
+    record_start: Any
+    count: int
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """A voxelised scene, not yet lit.
+
+    Attributes:
+        box: Where it is.
+        volume: The brick maps of all levels; ``field`` is zero.
+        level_records: Records of each level; level ``l`` starts at ``sum(level_records[:l])``.
+        level_keys: Sorted voxel keys per level.
+        area: vec2 ``[level-0 records * 6]``, projected area per face, before and after, in voxel faces.
+        fragments: The pieces that the records are made of.
+    """
+
+    box: Box
+    volume: Any
+    level_records: tuple[int, ...]
+    level_keys: tuple[Any, ...]
+    area: Any
+    fragments: Fragments
+
+
+def voxelize(launcher: Launcher, triangles: Any, normals: Any, double_sided: Any, synthetic_first: int, box: Box) -> Voxels:
+    """Cut triangles by the voxel grid and build the brick maps of all levels.
+
+    Args:
+        triangles: Corners in volume space, vec3 ``[3 t]``, real ones first.
+        normals: Unit geometric normals, vec3 ``[t]``.
+        double_sided: int ``[t]``; non-zero where the back faces show as well.
+        synthetic_first: Index of the first synthetic triangle.
+        box: The grid, ``n`` from 1 to 1024.
+    Returns:
+        Voxels with a zero field. Triangles outside of the box are left out.
+    """
+    fragments, keys = _cut(launcher, triangles, box)
+    key0 = keys
+    level_keys = [key0]
+    levels = 1
+    while (box.n - 1) >> (levels - 1) > 0:
+        level_keys.append(_parents(launcher, level_keys[-1], box.n, levels - 1))
+        levels += 1
+    volume = _build_maps(launcher, level_keys, box)
+    records = key0.shape[0]
+    area = launcher.zeros(max(records, 1) * 6, wp.vec2)
+    launcher.launch(
+        kernels._sum_areas,
+        records,
+        [
+            fragments.record_start,
+            fragments.order,
+            fragments.triangle,
+            fragments.place,
+            normals,
+            double_sided,
+            synthetic_first,
+            fragments.count,
+            records,
+        ],
+        [area],
+    )
+    return Voxels(box, volume, tuple(k.shape[0] for k in level_keys), tuple(level_keys), area, fragments)
+
+
+def _cut(launcher: Launcher, triangles: Any, box: Box) -> tuple[Fragments, Any]:
+    """Fragments and the sorted unique keys of the voxels that hold them."""
+    grid = [wp.vec3(*box.low), box.voxel, box.n]
+    count = triangles.shape[0] // 3
+    per_triangle = launcher.zeros(max(count, 1), wp.int32)
+    launcher.launch(kernels._count_tiles, count, [triangles, *grid], [per_triangle])
+    ends, total = scan(launcher, per_triangle)
+    tile_triangle = launcher.empty(max(total, 1), wp.int32)
+    tile = launcher.empty(max(total, 1), wp.int32)
+    launcher.launch(kernels._list_tiles, count, [triangles, ends, per_triangle, *grid], [tile_triangle, tile])
+
+    per_tile = launcher.zeros(max(total, 1), wp.int32)
+    launcher.launch(kernels._count_fragments, total, [triangles, tile_triangle, tile, *grid], [per_tile])
+    ends, listed = scan(launcher, per_tile)
+    key = launcher.empty(max(2 * listed, 1), wp.int32)
+    order = launcher.empty(max(2 * listed, 1), wp.int32)
+    fragment_triangle = launcher.empty(max(listed, 1), wp.int32)
+    place = launcher.empty(max(listed, 1), wp.vec4)
+    launcher.launch(
+        kernels._cut_fragments,
+        total,
+        [triangles, tile_triangle, tile, ends, per_tile, *grid],
+        [key, fragment_triangle, place],
+    )
+    sort_by_key(launcher, key, order, listed)
+    keys, starts = unique_runs(launcher, key, listed)
+    valid = count_below(launcher, key, listed)
+    return Fragments(fragment_triangle, place, order, starts, valid), keys
+
+
+def sort_by_key(launcher: Launcher, key: Any, order: Any, count: int) -> None:
+    """Sort ``key[:count]`` in place and fill ``order`` with the permutation; both hold 2 * count entries. Stable."""
+    launcher.launch(kernels._count_up, count, [], [order])
+    if count > 1:
+        wp.utils.radix_sort_pairs(key, order, count)
+
+
+def scan(launcher: Launcher, counts: Any) -> tuple[Any, int]:
+    """Inclusive prefix sum, and the total."""
+    ends = launcher.empty(counts.shape[0], wp.int32)
+    wp.utils.array_scan(counts, ends, inclusive=True)
+    return ends, int(ends[-1:].numpy()[0])
+
+
+def count_below(launcher: Launcher, key: Any, count: int) -> int:
+    """Entries of a sorted key array that are not EMPTY_KEY."""
+    if count == 0:
+        return 0
+    found = launcher.zeros(1, wp.int32)
+    launcher.launch(kernels._find_end, count, [key, count], [found])
+    return int(found.numpy()[0])
+
+
+def unique_runs(launcher: Launcher, key: Any, count: int, shift: int = 0) -> tuple[Any, Any]:
+    """Unique values of ``key[:count] >> shift`` (sorted, without EMPTY_KEY) and the index where each begins."""
+    mark = launcher.zeros(max(count, 1), wp.int32)
+    launcher.launch(kernels._mark_starts, count, [key, shift], [mark])
+    rank, unique = scan(launcher, mark)
+    keys = launcher.empty(unique, wp.int32)
+    starts = launcher.empty(max(unique, 1), wp.int32)
+    launcher.launch(kernels._list_starts, count, [key, mark, rank, shift], [keys, starts])
+    return keys, starts
+
+
+def _parents(launcher: Launcher, keys: Any, n: int, level: int) -> Any:
+    count = keys.shape[0]
+    parent = launcher.empty(max(2 * count, 1), wp.int32)
+    order = launcher.empty(max(2 * count, 1), wp.int32)
+    launcher.launch(kernels._parent_keys, count, [keys, n, level], [parent])
+    sort_by_key(launcher, parent, order, count)
+    return unique_runs(launcher, parent, count)[0]
+
+
+def level_bricks(n: int, level: int) -> int:
+    """Bricks an edge of a level."""
+    return -(-(((n - 1) >> level) + 1) // 8)
+
+
+def _build_maps(launcher: Launcher, level_keys: list[Any], box: Box) -> Any:
+    bricks = [unique_runs(launcher, keys, keys.shape[0], shift=9)[0] for keys in level_keys]
+    sizes = [level_bricks(box.n, level) ** 3 for level in range(len(level_keys))]
+    table_start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
+    tables = launcher.full(int(table_start[-1]), -1, wp.int32)
+    cells = launcher.full(max(1, sum(b.shape[0] for b in bricks) * 512), -1, wp.int32)
+    records = sum(k.shape[0] for k in level_keys)
+    brick_start = record_start = 0
+    for level, (keys, held) in enumerate(zip(level_keys, bricks, strict=True)):
+        start = int(table_start[level])
+        launcher.launch(kernels._fill_table, held.shape[0], [held, start, brick_start], [tables])
+        launcher.launch(kernels._fill_cells, keys.shape[0], [keys, tables, start, record_start], [cells])
+        brick_start += held.shape[0]
+        record_start += keys.shape[0]
+    volume = Volume()
+    volume.low = wp.vec3(*box.low)
+    volume.voxel = box.voxel
+    volume.n = box.n
+    volume.levels = len(level_keys)
+    volume.table_start = launcher.array(table_start[:-1].copy(), wp.int32)
+    volume.tables = tables
+    volume.cells = cells
+    volume.field = launcher.zeros(max(1, records * 12), wp.vec4)
+    return volume
