@@ -36,8 +36,8 @@ def path(name: str) -> Path:
     """
     if name not in names():
         near = difflib.get_close_matches(name, names(), n=1)
-        hint = f"; did you mean '{near[0]}'?" if near else ""
-        raise OptionError(f"there is no bundled stage '{name}'{hint} Bundled: {', '.join(names())}")
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise OptionError(f"there is no bundled stage '{name}'; {hint}bundled are {', '.join(names())}")
     file = FOLDER / f"{name}.usda"
     text = file.read_text(encoding="utf-8")
     if BUNNY_ASSET not in text:
