@@ -78,11 +78,11 @@ class Launcher:
         if key in self._loaded:
             return
         start = time.perf_counter()
-        quiet, wp.config.quiet = wp.config.quiet, True
+        level, wp.config.log_level = wp.config.log_level, wp.LOG_WARNING
         try:
             module.load(self.device)
         finally:
-            wp.config.quiet = quiet
+            wp.config.log_level = level
         spent = time.perf_counter() - start
         self.compile_seconds += spent
         for scope in self._scopes:
@@ -136,8 +136,8 @@ class Launcher:
             size = int(np.prod(shape)) * wp.types.type_size_in_bytes(dtype)
             where = self._scopes[-1][0] if self._scopes else "loading the scene"
             raise DeviceError(
-                f"out of memory in pass '{where}': {size / 2**20:.0f} MiB more were asked for on {self.device.alias} with"
-                f" {self.live_bytes / 2**20:.0f} MiB in use; lower --set volume.resolution or --imageWidth ({error})"
+                f"out of memory in pass '{where}': {size / 2**20:.0f} MiB more were asked for on {self.device.alias}"
+                f" with {self.live_bytes / 2**20:.0f} MiB in use; lower --set volume.resolution or --imageWidth ({error})"
             ) from error
         size = array.capacity
         self.live_bytes += size
@@ -155,8 +155,11 @@ def find_device(name: str) -> Any:
     Raises:
         DeviceError: It is not present; the message lists what is.
     """
-    wp.config.quiet = True
-    wp.init()
+    level, wp.config.log_level = wp.config.log_level, wp.LOG_WARNING
+    try:
+        wp.init()
+    finally:
+        wp.config.log_level = level
     present = [d.alias for d in wp.get_devices()]
     if name == "cuda" and wp.is_cuda_available():
         return wp.get_preferred_device()

@@ -16,8 +16,8 @@ class Radiance:
         width, height: Size in pixels.
         before: vec3, mean radiance of the real scene alone over the whole pixel; it is the plate where there is none.
             None where a plate is given and the method had no need of it.
-        delta: vec3, after minus before, averaged over the part of the pixel that shows real surface (or background)
-            in the after picture; 0 where there is no such part.
+        delta: vec3, after minus before over the part of the pixel that shows real surface (or background) in the after
+            picture, summed over that part and divided by the whole pixel; 0 where there is no such part.
         synthetic: vec4, synthetic radiance premultiplied by its coverage, and the coverage.
         albedo, normal, position: vec3 of the first surface seen (synthetic or real) at the pixel's centre; normal and
             position in world space and metres; 0 where there is none.
@@ -54,6 +54,8 @@ class Layers:
         albedo, normal, position: ``[h, w, 3]``; position in metres, world space.
         depth: ``[h, w]``, metres along the view axis; inf where nothing is seen.
         mask_real, mask_synthetic: ``[h, w]``, coverage in [0, 1].
+        clamped: Channel values that half precision cannot hold and that were clamped to +-65504.
+        invalid: NaN channel values that were set to 0.
     """
 
     rgba: np.ndarray
@@ -68,3 +70,5 @@ class Layers:
     depth: np.ndarray
     mask_real: np.ndarray
     mask_synthetic: np.ndarray
+    clamped: int = 0
+    invalid: int = 0
