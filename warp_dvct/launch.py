@@ -137,7 +137,8 @@ class Launcher:
             where = self._scopes[-1][0] if self._scopes else "loading the scene"
             raise DeviceError(
                 f"out of memory in pass '{where}': {size / 2**20:.0f} MiB more were asked for on {self.device.alias}"
-                f" with {self.live_bytes / 2**20:.0f} MiB in use; lower --set volume.resolution or --imageWidth ({error})"
+                f" with {self.live_bytes / 2**20:.0f} MiB in use; lower --set volume.resolution or --imageWidth"
+                f" ({error})"
             ) from error
         size = array.capacity
         self.live_bytes += size
