@@ -1,0 +1,135 @@
+"""Cone marching through the pyramids: both occupancies and both fields in one march."""
+
+import warp as wp
+
+from warp_dvct.kernels.volume import Volume, face_of, find_record
+
+wp.set_module_options({"enable_backward": False})
+
+OPAQUE = wp.constant(0.999)  # a march ends when this share of the cone is covered in both solutions
+
+
+@wp.struct
+class ConeSettings:
+    aperture: float  # full opening angle [rad]
+    step: float  # in voxels of the current level
+    start: float  # first sample's distance, in level-0 voxels
+    reach: float  # farthest distance, in volume space
+    additive: int  # 1: coverage adds up (surfaces); 0: eq. 4's product of transparencies
+    split: int  # 1: the paper's single occupancy, with the field's difference in ``before``
+
+
+@wp.struct
+class ConeResult:
+    """(radiosity * coverage, coverage) of the two solutions."""
+
+    before: wp.vec4
+    after: wp.vec4
+
+
+@wp.func
+def sample_volume(volume: Volume, level: int, position: wp.vec3, direction: wp.vec3) -> ConeResult:
+    """Trilinear sample of the faces that a ray along ``direction`` sees, weighted by its direction cosines."""
+    size = volume.voxel * float(1 << level)
+    local = (position - volume.low) / size - wp.vec3(0.5, 0.5, 0.5)
+    x0 = int(wp.floor(local[0]))
+    y0 = int(wp.floor(local[1]))
+    z0 = int(wp.floor(local[2]))
+    fx = local[0] - float(x0)
+    fy = local[1] - float(y0)
+    fz = local[2] - float(z0)
+    face_x = 2 * face_of(0, -direction[0])
+    face_y = 2 * face_of(1, -direction[1])
+    face_z = 2 * face_of(2, -direction[2])
+    wx = wp.abs(direction[0])
+    wy = wp.abs(direction[1])
+    wz = wp.abs(direction[2])
+    result = ConeResult()
+    result.before = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    result.after = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    for corner in range(8):
+        dx = corner & 1
+        dy = (corner >> 1) & 1
+        dz = corner >> 2
+        record = find_record(volume, level, x0 + dx, y0 + dy, z0 + dz)
+        if record >= 0:
+            weight = wp.where(dx == 1, fx, 1.0 - fx) * wp.where(dy == 1, fy, 1.0 - fy) * wp.where(dz == 1, fz, 1.0 - fz)
+            at = record * 12
+            result.before += weight * (
+                wx * volume.field[at + face_x] + wy * volume.field[at + face_y] + wz * volume.field[at + face_z]
+            )
+            result.after += weight * (
+                wx * volume.field[at + face_x + 1] + wy * volume.field[at + face_y + 1] + wz * volume.field[at + face_z + 1]
+            )
+    return result
+
+
+@wp.func
+def accumulate(total: wp.vec4, value: wp.vec4, step: float, additive: int) -> wp.vec4:
+    """Front-to-back compositing of one step.
+
+    ``value`` is an area density per voxel length, so ``value * step`` is the expected number of surfaces crossed.
+    Additively the first crossing is opaque; otherwise eqs. 3 and 4, with the step's length in the exponent.
+    """
+    free = 1.0 - total[3]
+    alpha = value[3]
+    if free <= 0.0 or alpha <= 0.0:
+        return total
+    if additive != 0:
+        return total + value * wp.min(step, free / alpha)
+    covered = 1.0 - wp.pow(1.0 - wp.min(alpha, 1.0), step)
+    return total + value * (free * covered / alpha)
+
+
+@wp.func
+def inside_box(volume: Volume, position: wp.vec3) -> bool:
+    edge = volume.voxel * float(volume.n)
+    local = position - volume.low
+    return wp.min(local[0], wp.min(local[1], local[2])) >= 0.0 and wp.max(local[0], wp.max(local[1], local[2])) <= edge
+
+
+@wp.func
+def march_cone(
+    fine: Volume, coarse: Volume, has_coarse: int, origin: wp.vec3, direction: wp.vec3, cone: ConeSettings
+) -> ConeResult:
+    """Franke 2014, section 3.3, eqs. 3 and 4, for both solutions at once: ``before`` sees real surfaces alone.
+
+    The march goes through the fine volume and, beyond its border, through the coarse one. With ``cone.split`` the
+    result's ``before`` is the delta field under the single occupancy of all surfaces.
+    """
+    total = ConeResult()
+    total.before = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    total.after = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    spread = 2.0 * wp.tan(0.5 * cone.aperture)
+    t = float(cone.start * fine.voxel)
+    searching = bool(True)
+    while searching and t < cone.reach:
+        width = wp.max(spread * t, fine.voxel)
+        position = origin + direction * t
+        in_fine = inside_box(fine, position)
+        step = float(0.0)
+        value = ConeResult()
+        if in_fine or has_coarse != 0:
+            voxel = fine.voxel
+            levels = fine.levels
+            if not in_fine:
+                voxel = coarse.voxel
+                levels = coarse.levels
+            level = wp.clamp(int(wp.floor(wp.log2(wp.max(width / voxel, 1.0)))), 0, levels - 1)
+            step = cone.step * voxel * float(1 << level)
+            middle = position + direction * (0.5 * step)
+            if in_fine:
+                value = sample_volume(fine, level, middle, direction)
+            else:
+                value = sample_volume(coarse, level, middle, direction)
+                searching = inside_box(coarse, middle)
+        else:
+            searching = False
+        if cone.split != 0:
+            delta = value.after - value.before
+            value.before = wp.vec4(delta[0], delta[1], delta[2], value.after[3])
+        total.before = accumulate(total.before, value.before, cone.step, cone.additive)
+        total.after = accumulate(total.after, value.after, cone.step, cone.additive)
+        t += step
+        searching = searching and (total.before[3] < OPAQUE or total.after[3] < OPAQUE)
+    return total

@@ -1,0 +1,109 @@
+"""Split-injection of RSM flux into voxel faces, ordered by voxel so that the sums repeat bit for bit."""
+
+import warp as wp
+
+from warp_dvct.kernels.volume import Volume, face_weight, find_record
+from warp_dvct.kernels.voxelization import EMPTY_KEY
+
+wp.set_module_options({"enable_backward": False})
+
+NUDGE = wp.constant(0.3)  # voxels; a point on the wall between two voxels may round into the empty one
+
+
+@wp.func
+def shown_area(area: wp.array(dtype=wp.vec2), record: int, normal: wp.vec3, solution: int) -> float:
+    total = float(0.0)
+    for face in range(6):
+        total += face_weight(normal, face) * area[record * 6 + face][solution]
+    return total
+
+
+@wp.func
+def record_at(volume: Volume, area: wp.array(dtype=wp.vec2), position: wp.vec3, normal: wp.vec3, solution: int) -> int:
+    """The record that holds a surface point of that orientation, or -1."""
+    local = (position - volume.low) / volume.voxel
+    for attempt in range(3):
+        p = local
+        if attempt == 1:
+            p = local - normal * NUDGE
+        if attempt == 2:
+            p = local + normal * NUDGE
+        record = find_record(volume, 0, int(wp.floor(p[0])), int(wp.floor(p[1])), int(wp.floor(p[2])))
+        if record >= 0:
+            if shown_area(area, record, normal, solution) > 0.0:
+                return record
+    return -1
+
+
+@wp.kernel
+def _find_targets(
+    first: int,
+    volume: Volume,
+    area_in: wp.array(dtype=wp.vec2),
+    position_after_in: wp.array(dtype=wp.vec3),
+    normal_after_in: wp.array(dtype=wp.vec3),
+    role_after_in: wp.array(dtype=wp.int32),
+    position_before_in: wp.array(dtype=wp.vec3),
+    normal_before_in: wp.array(dtype=wp.vec3),
+    role_before_in: wp.array(dtype=wp.int32),
+    texels: int,
+    key_out: wp.array(dtype=wp.int32),
+):
+    """Records that texel i feeds: entry i by its after surface, entry texels + i by its before surface.
+
+    Where both maps see the same real surface, entry i stands for both and the other is empty.
+    """
+    i = first + wp.tid()
+    after = int(-1)
+    before = int(-1)
+    if role_after_in[i] >= 0:
+        after = record_at(volume, area_in, position_after_in[i], normal_after_in[i], 1)
+    if role_before_in[i] >= 0 and role_after_in[i] != 0:
+        before = record_at(volume, area_in, position_before_in[i], normal_before_in[i], 0)
+    key_out[i] = wp.where(after >= 0, after, EMPTY_KEY)
+    key_out[texels + i] = wp.where(before >= 0, before, EMPTY_KEY)
+
+
+@wp.kernel
+def _inject(
+    first: int,
+    record_in: wp.array(dtype=wp.int32),
+    start_in: wp.array(dtype=wp.int32),
+    order_in: wp.array(dtype=wp.int32),
+    normal_after_in: wp.array(dtype=wp.vec3),
+    flux_after_in: wp.array(dtype=wp.vec3),
+    normal_before_in: wp.array(dtype=wp.vec3),
+    flux_before_in: wp.array(dtype=wp.vec3),
+    role_after_in: wp.array(dtype=wp.int32),
+    role_before_in: wp.array(dtype=wp.int32),
+    texels: int,
+    runs: int,
+    entries: int,
+    inverse_face: float,
+    flux_out: wp.array(dtype=wp.vec3),
+):
+    """Add the texels of one record to its faces: eq. 2's cosine becomes the share max(0, n . e) of each face.
+
+    A texel whose first surface is synthetic adds +flux there (after) and has its real surface's flux in before alone,
+    so that after - before holds the paper's -flux: the split-injection.
+    """
+    i = first + wp.tid()
+    record = record_in[i]
+    end = entries
+    if i + 1 < runs:
+        end = start_in[i + 1]
+    for face in range(6):
+        before = wp.vec3(0.0, 0.0, 0.0)
+        after = wp.vec3(0.0, 0.0, 0.0)
+        for j in range(start_in[i], end):
+            entry = order_in[j]
+            if entry < texels:
+                share = face_weight(normal_after_in[entry], face)
+                if share > 0.0:
+                    after += flux_after_in[entry] * share
+                    if role_after_in[entry] == 0 and role_before_in[entry] == 0:
+                        before += flux_after_in[entry] * share
+            else:
+                before += flux_before_in[entry - texels] * face_weight(normal_before_in[entry - texels], face)
+        flux_out[(record * 6 + face) * 2] += before * inverse_face
+        flux_out[(record * 6 + face) * 2 + 1] += after * inverse_face
