@@ -45,7 +45,7 @@ def write_exr(
     }
     if camera is not None:
         header["camera"] = camera.path
-        header["worldToCamera"] = np.linalg.inv(camera.to_world).T.astype(np.float32)
+        header["worldToCamera"] = np.ascontiguousarray(np.linalg.inv(camera.to_world).T, np.float32)
     with _replacing(Path(path)) as temporary:
         try:
             with OpenEXR.File(header, exr_channels(layers)) as file:

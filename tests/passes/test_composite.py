@@ -17,11 +17,6 @@ from warp_dvct.passes.composite import composite
 HALF_MAX = 65504.0
 
 
-@pytest.fixture(scope="module")
-def launcher() -> Launcher:
-    return Launcher("cpu", threads=2)
-
-
 def half(values: np.ndarray) -> np.ndarray:
     return np.asarray(values, np.float32).astype(np.float16).astype(np.float32)
 
@@ -175,7 +170,9 @@ def test_layers_are_always_finite_in_range_and_recombine(launcher, values):
 
 def test_result_does_not_depend_on_the_thread_count(launcher):
     pixels = random_pixels(np.random.default_rng(3), 5000)
-    np.testing.assert_array_equal(run(launcher, *pixels).comp, run(Launcher("cpu", threads=1), *pixels).comp)
+    np.testing.assert_array_equal(
+        run(launcher, *pixels).comp, run(Launcher(str(launcher.device), threads=1), *pixels).comp
+    )
 
 
 def test_plate_of_another_size_names_both(launcher):

@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 
 from warp_dvct.errors import OptionError
-from warp_dvct.launch import Launcher
 from warp_dvct.passes.tonemap import tonemap
-
-
-@pytest.fixture(scope="module")
-def launcher() -> Launcher:
-    return Launcher("cpu", threads=2)
 
 
 def decode_srgb(codes: np.ndarray) -> np.ndarray:
