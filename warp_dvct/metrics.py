@@ -55,8 +55,8 @@ def flip_ldr(reference: np.ndarray, test: np.ndarray, exposure: float = 0.0) -> 
     """
     _difference(reference, test)
     flip = import_flip()
-    pictures = [np.ascontiguousarray(to_display(picture, exposure)) for picture in (reference, test)]
-    error, mean, _ = flip.evaluate(*pictures, "LDR", applyMagma=False)
+    shown, other = (np.ascontiguousarray(to_display(picture, exposure)) for picture in (reference, test))
+    error, mean, _ = flip.evaluate(shown, other, "LDR", applyMagma=False)
     return float(mean), np.asarray(error, np.float32).reshape(reference.shape[:2])
 
 

@@ -1,0 +1,130 @@
+"""``python -m warp_dvct.bench error | table1``: see ``docs/benchmarks.md``."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+
+from warp_dvct.errors import DvctError, OptionError
+from warp_dvct.image import write_text
+from warp_dvct.usd_scenes import cache_folder
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+def bench() -> None:
+    """Measure errors against the path-traced truth, and times beside the paper's."""
+
+
+def _shared(command: Any) -> Any:
+    for option in (
+        click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="A setting, as in warp-dvct relight."),
+        click.option("--device", default="cpu", show_default=True, help="cpu or cuda:N."),
+        click.option("--threads", type=int, help="CPU threads; all cores by default."),
+        click.option(
+            "--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file too."
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+@bench.command()
+@click.option(
+    "--stage", "stages", multiple=True, help="A bundled stage or a USD file; repeatable. Default: all lit ones."
+)
+@click.option("--method", default="delta-cones", show_default=True)
+@click.option("--quality", default="balanced", show_default=True)
+@click.option("--width", type=int, default=640, show_default=True, help="Pixels; the height follows the camera.")
+@click.option("--spp", type=int, default=128, show_default=True, help="Samples per pixel of the truth.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Of the truth's random numbers.")
+@click.option("--bounces", type=int, default=8, show_default=True, help="Of the many-bounce truth.")
+@click.option("--exposure", type=float, default=0.0, show_default=True, help="Stops, before FLIP and PNG.")
+@click.option("--cache", type=click.Path(path_type=Path), help="References; default: warp_dvct in the user's cache.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for PNGs: composite, truth, error map.")
+@_shared
+def error(
+    stages: tuple[str, ...], pairs: tuple[str, ...], json_file: Path | None, spp: int, cache: Path | None, **rest
+):
+    """Compare a method with the path-traced truth (kept in a cache) and with two baselines."""
+    from warp_dvct.bench import error as module
+
+    cache = cache or cache_folder() / "references"
+    options = module.ErrorOptions(settings=settings_of(pairs), samples=spp, cache=cache, **rest)
+    reports = []
+    for stage in stages or module.LIT_STAGES:
+        reports.append(module.measure(stage, options))
+        click.echo(module.format_report(reports[-1]))
+    if json_file is not None:
+        write_json(json_file, {"options": asdict(options), "stages": [asdict(report) for report in reports]})
+
+
+@bench.command()
+@click.option("--quality", default="balanced", show_default=True)
+@click.option("--runs", type=int, default=3, show_default=True, help="Warm runs per row; the median is printed.")
+@click.option("--width", type=int, default=1280, show_default=True)
+@click.option("--height", type=int, default=720, show_default=True)
+@_shared
+def table1(quality: str, pairs: tuple[str, ...], json_file: Path | None, **rest):
+    """The paper's Table 1 (256^3 voxels, 720p, RSM of 1024^2) with this machine's times beside."""
+    from warp_dvct.bench import table1 as module
+
+    settings = {**module.PAPER_SETTINGS, **settings_of(pairs)}
+    times = [module.measure(v, quality=quality, settings=settings, **rest) for v in module.VARIANTS]
+    shown = " ".join(f"{k}={v}" for k, v in settings.items())
+    title = f"Table 1, {rest['width']}x{rest['height']}, {quality}, {shown}, median of {rest['runs']}, {rest['device']}"
+    click.echo(module.format_table(times, title))
+    if json_file is not None:
+        write_json(json_file, {"title": title, "machine": module.machine(), "times": [asdict(t) for t in times]})
+
+
+def settings_of(pairs: tuple[str, ...]) -> dict[str, str]:
+    """``key=value`` strings as a dict.
+
+    Raises:
+        OptionError: One without ``=``.
+    """
+    settings = {}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not equals or not key:
+            raise OptionError(f"--set {pair!r} is not KEY=VALUE")
+        settings[key.strip()] = value.strip()
+    return settings
+
+
+def write_json(file: Path, content: dict[str, Any]) -> None:
+    """Write figures as JSON; NaN becomes null and a path its text.
+
+    Raises:
+        FileError: The file cannot be written.
+    """
+    write_text(file, json.dumps(_plain(content), indent=1, allow_nan=False) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def main() -> None:
+    """Run a command; errors that a user can mend go to stderr with exit status 1."""
+    try:
+        bench(prog_name="python -m warp_dvct.bench")
+    except DvctError as problem:
+        click.echo(f"error: {problem}", err=True)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

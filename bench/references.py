@@ -1,0 +1,269 @@
+"""Path-traced truths, kept in a cache that is keyed by what was traced and by the code that traced it."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib.util
+import os
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from warp_dvct.device_scene import DeviceScene
+from warp_dvct.errors import FileError, OptionError, StageError
+from warp_dvct.launch import Launcher
+from warp_dvct.metrics import flip_ldr
+from warp_dvct.scene import Material, Role, Scene
+
+BATCH = 8  # samples per pixel of one launch: short enough for a lively progress bar
+UNHASHED = {"name", "path", "notices", "plate"}  # labels; they do not change the picture
+TRACERS = ("warp_dvct.methods.path_tracing", "warp_dvct.device_scene")
+TRACED_WITH = ("warp_dvct.kernels.", "warp_dvct.methods.", "warp_dvct.passes.")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The truth of one picture: linear float32 arrays, row 0 on top.
+
+    Attributes:
+        before: Real scene alone, ``[h, w, 3]``.
+        delta: After minus before over the real part of each pixel, weighted by that part, ``[h, w, 3]``.
+        synthetic: Premultiplied radiance of the synthetic objects and their coverage, ``[h, w, 4]``.
+        noise: LDR-FLIP that the reference's own noise is worth: half of that between its two halves, traced with
+            different random numbers.
+    """
+
+    before: np.ndarray
+    delta: np.ndarray
+    synthetic: np.ndarray
+    noise: float
+
+    @property
+    def coverage(self) -> np.ndarray:
+        """Coverage by synthetic objects, ``[h, w]`` in [0, 1]."""
+        return self.synthetic[..., 3]
+
+    @property
+    def comp(self) -> np.ndarray:
+        """The true picture with this reference's 'before' as the plate."""
+        return combine(self.before, self.delta, self.synthetic)
+
+
+def combine(plate: np.ndarray, delta: np.ndarray, synthetic: np.ndarray) -> np.ndarray:
+    """Synthetic over plate + delta, with ``delta`` weighted by the pixel's real part; never negative."""
+    return np.maximum(synthetic[..., :3] + (1 - synthetic[..., 3:]) * plate + delta, 0).astype(np.float32)
+
+
+class ReferenceStore:
+    """Traces references of one scene and keeps them in ``cache``.
+
+    Args:
+        scene: What is traced.
+        width, height: Pixels.
+        samples: Per pixel; rounded up to two equal halves of whole batches.
+        seed: Of the random numbers.
+        cache: Folder; made if missing.
+        launcher: Where to trace.
+        quiet: No progress bar.
+    Raises:
+        OptionError: ``samples`` below 1.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        width: int,
+        height: int,
+        *,
+        samples: int,
+        seed: int,
+        cache: Path,
+        launcher: Launcher,
+        quiet: bool = False,
+    ) -> None:
+        if samples < 1:
+            raise OptionError(f"--spp is {samples}; give a number of at least 1")
+        self.scene, self.width, self.height, self.seed = scene, width, height, seed
+        self.batch = min(BATCH, -(-samples // 2))
+        self.batches = 2 * -(-samples // (2 * self.batch))
+        self.samples = self.batch * self.batches
+        self.cache, self.launcher, self.quiet = cache, launcher, quiet
+        self._device_scene: Any = None
+
+    def get(self, bounces: int) -> Reference:
+        """The truth with ``bounces`` indirect bounces (0 is direct light only), from the cache if it is there.
+
+        Raises:
+            FileError: The cache cannot be written.
+        """
+        file = self.cache / f"{self.key(bounces)}.npz"
+        reference = _load(file)
+        if reference is None:
+            reference = self._trace(bounces)
+            _save(file, reference)
+        return reference
+
+    def key(self, bounces: int) -> str:
+        """Hash of scene, picture size, samples, bounces, seed and the tracer's sources."""
+        sha = hashlib.sha256()
+        for part in _flatten(self.scene):
+            sha.update(part)
+        numbers = (self.width, self.height, self.samples, self.batch, bounces, self.seed)
+        sha.update(repr(numbers).encode() + source_digest(*TRACERS).encode())
+        return sha.hexdigest()[:32]
+
+    def glossy_mask(self) -> np.ndarray:
+        """Pixels whose first surface at the centre is real and reflects visibly, bool ``[h, w]``.
+
+        The scene is drawn once with white for glossy real surfaces and black for all others.
+        """
+        labelled = label_glossy(self.scene)
+        radiance = self._path_trace(self.launcher, self._upload(labelled), labelled, 1, 0, self.seed)
+        return radiance.albedo.numpy().reshape(self.height, self.width, 3)[..., 0] > 0.5
+
+    def _trace(self, bounces: int) -> Reference:
+        if self._device_scene is None:
+            self._device_scene = self._upload(self.scene)
+        shape = (self.height, self.width)
+        halves = [[np.zeros((*shape, n)) for n in (3, 3, 4)] for _ in range(2)]
+        title = f"truth {self.width}x{self.height}, {bounces} bounces"
+        disable = True if self.quiet else None  # None: only on a terminal
+        with tqdm(total=self.samples, desc=title, unit="spp", disable=disable, leave=False) as bar:
+            for k in range(self.batches):
+                seed = self.seed + 7919 * k
+                radiance = self._path_trace(self.launcher, self._device_scene, self.scene, self.batch, bounces, seed)
+                for total, array in zip(
+                    halves[k % 2], (radiance.before, radiance.delta, radiance.synthetic), strict=True
+                ):
+                    total += array.numpy().reshape(total.shape)
+                bar.update(self.batch)
+        means = [((a + b) / self.batches).astype(np.float32) for a, b in zip(*halves, strict=True)]
+        # Both halves on the same plate: a 'before' that two compared pictures share is no noise between them.
+        one, other = (combine(means[0], *(total * (2 / self.batches) for total in half[1:])) for half in halves)
+        return Reference(*means, noise=flip_ldr(one, other)[0] / 2)
+
+    def _path_trace(self, launcher, device_scene, scene, samples, bounces, seed):
+        from warp_dvct.methods.path_tracing import path_trace
+
+        return path_trace(
+            launcher, device_scene, scene, self.width, self.height, samples=samples, bounces=bounces, seed=seed
+        )
+
+    def _upload(self, scene: Scene) -> Any:
+        bounds = scene.bounds()
+        if bounds is None:
+            raise StageError("the stage has no triangles to trace; check purposes and visibility")
+        low, high = bounds
+        return DeviceScene.upload(self.launcher, scene, (low + high) / 2, 1 / float((high - low).max()))
+
+
+def label_glossy(scene: Scene) -> Scene:
+    """The scene with Lambert materials: white where a real surface has a lobe sharper than 0.5, black elsewhere."""
+    labels = []
+    for role in Role:
+        for material in scene.materials:
+            value = float(role == Role.REAL and is_glossy(material))
+            labels.append(
+                Material(base_color=(value, value, value), specular_color=(0.0, 0.0, 0.0), name=material.name)
+            )
+    count = len(scene.materials)
+    meshes = tuple(
+        replace(m, materials=(m.materials + count * int(m.role)).astype(np.int32), corner_colors=None)
+        for m in scene.meshes
+    )
+    return replace(scene, meshes=meshes, materials=tuple(labels), textures=())
+
+
+def is_glossy(material: Material) -> bool:
+    """Whether a reflection in it is worth a region of its own: some specular reflection, roughness below 0.5."""
+    if material.specular_color is not None:
+        reflects = max(material.specular_color) > 0
+    else:
+        reflects = material.metallic > 0 or material.ior != 1
+    return reflects and (material.roughness < 0.5 or material.roughness_texture is not None)
+
+
+def source_digest(*modules: str) -> str:
+    """Hash of the sources of ``modules`` and of the kernels, methods and passes that they import, to any depth."""
+    seen: dict[str, bytes] = {}
+    waiting = list(modules)
+    while waiting:
+        name = waiting.pop()
+        file = _source_file(name)
+        if file is None or name in seen:
+            continue
+        seen[name] = file.read_bytes()
+        waiting += [imported for imported in _imports(seen[name]) if imported.startswith(TRACED_WITH)]
+    sha = hashlib.sha256()
+    for name in sorted(seen):
+        sha.update(name.encode() + seen[name])
+    return sha.hexdigest()
+
+
+def _source_file(name: str) -> Path | None:
+    """The file of a module; None where ``name`` is something inside of one."""
+    try:
+        spec = importlib.util.find_spec(name)
+    except ModuleNotFoundError:
+        return None
+    return Path(spec.origin) if spec and spec.origin else None
+
+
+def _imports(source: bytes) -> Iterator[str]:
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)  # some are modules
+
+
+def _flatten(value: Any) -> Iterator[bytes]:
+    """Bytes that differ where two scenes differ."""
+    if isinstance(value, np.ndarray):
+        yield f"{value.dtype}{value.shape}".encode()
+        yield np.ascontiguousarray(value).tobytes()
+    elif is_dataclass(value):
+        yield type(value).__name__.encode()
+        for item in fields(value):
+            if item.name not in UNHASHED:
+                yield item.name.encode()
+                yield from _flatten(getattr(value, item.name))
+    elif isinstance(value, (tuple, list)):
+        yield f"({len(value)}".encode()
+        for item in value:
+            yield from _flatten(item)
+    else:
+        yield repr(value).encode() + b";"
+
+
+def _load(file: Path) -> Reference | None:
+    """The stored reference; None where there is none, or one that a crash left unreadable."""
+    try:
+        with np.load(file) as data:
+            return Reference(data["before"], data["delta"], data["synthetic"], float(data["noise"]))
+    except (FileNotFoundError, zipfile.BadZipFile, KeyError, ValueError, EOFError):
+        return None
+
+
+def _save(file: Path, reference: Reference) -> None:
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".tmp", delete=False) as out:
+            np.savez_compressed(
+                out,
+                before=reference.before,
+                delta=reference.delta,
+                synthetic=reference.synthetic,
+                noise=np.float64(reference.noise),
+            )
+        os.replace(out.name, file)
+    except OSError as error:
+        raise FileError(f"the reference cannot be written to {file}: {error}; choose a folder with --cache") from error
