@@ -184,9 +184,9 @@ def _save_pictures(folder: Path, stem: str, truth: np.ndarray, picture: np.ndarr
     except OSError as error:
         raise FileError(f"--out {folder} cannot be made: {error.strerror}") from error
     flip = import_flip()
-    shown = [np.ascontiguousarray(to_display(p, exposure)) for p in (truth, picture)]
-    error_map, _, _ = flip.evaluate(*shown, "LDR", applyMagma=True)
-    for name, pixels in (("truth", shown[0]), ("comp", shown[1]), ("flip", error_map)):
+    expected, comp = (np.ascontiguousarray(to_display(p, exposure)) for p in (truth, picture))
+    error_map, _, _ = flip.evaluate(expected, comp, "LDR", applyMagma=True)
+    for name, pixels in (("truth", expected), ("comp", comp), ("flip", error_map)):
         codes = np.clip(pixels * 255 + 0.5, 0, 255).astype(np.uint8)
         write_png(folder / f"{stem}_{name}.png", codes)
 

@@ -90,10 +90,10 @@ def measure(
     Raises:
         OptionError: ``runs`` below 1.
     """
-    from warp_dvct.relighter import Relighter
-
     if runs < 1:
         raise OptionError(f"--runs is {runs}; give a number of at least 1")
+    from warp_dvct.relighter import Relighter
+
     frames: list[tuple[dict, dict]] = []
     with tempfile.TemporaryDirectory() as folder:
         stage = variant_stage(variant, Path(folder))
@@ -129,14 +129,14 @@ def variant_stage(variant: Variant, folder: Path) -> Path:
     if not variant.roughness:
         return base
     overs = "\n".join(
-        f'over "{name}" {{ over "Surface" {{ float inputs:roughness = {value} }} }}'
+        f'over "{name}" {{\nover "Surface" {{\nfloat inputs:roughness = {value}\n}}\n}}'
         for name, value in variant.roughness.items()
     )
     file = folder / f"{variant.name}.usda"
     file.write_text(
         f'#usda 1.0\n(\n    defaultPrim = "World"\n    subLayers = [@{base.as_posix()}@]\n    upAxis = "Y"\n'
-        "    metersPerUnit = 1\n)\n"
-        f'over "World" {{ over "Materials" {{\n{overs}\n}} }}\n',
+        '    metersPerUnit = 1\n    renderSettingsPrimPath = "/Render/Settings"\n)\n'
+        f'over "World" {{\nover "Materials" {{\n{overs}\n}}\n}}\n',
         encoding="utf-8",
     )
     return file
