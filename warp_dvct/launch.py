@@ -80,7 +80,8 @@ class Launcher:
         start = time.perf_counter()
         level, wp.config.log_level = wp.config.log_level, wp.LOG_WARNING
         try:
-            module.load(self.device)
+            # Without it the CPU build is for blocks of 256, which no CPU launch uses: each thread would build again.
+            module.load(self.device, block_dim=1 if self.device.is_cpu else None)
         finally:
             wp.config.log_level = level
         spent = time.perf_counter() - start
