@@ -19,10 +19,11 @@ from tqdm import tqdm
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.errors import FileError, OptionError, StageError
 from warp_dvct.launch import Launcher
+from warp_dvct.layers import Radiance
+from warp_dvct.methods.path_tracing import PathTracer
 from warp_dvct.metrics import flip_ldr
 from warp_dvct.scene import Material, Role, Scene
 
-BATCH = 8  # samples per pixel of one launch: short enough for a lively progress bar
 UNHASHED = {"name", "path", "notices", "plate"}  # labels; they do not change the picture
 TRACERS = ("warp_dvct.methods.path_tracing", "warp_dvct.device_scene")
 TRACED_WITH = ("warp_dvct.kernels.", "warp_dvct.methods.", "warp_dvct.passes.")
@@ -67,7 +68,7 @@ class ReferenceStore:
     Args:
         scene: What is traced.
         width, height: Pixels.
-        samples: Per pixel; rounded up to two equal halves of whole batches.
+        samples: Per pixel; rounded up to two equal halves.
         seed: Of the random numbers.
         cache: Folder; made if missing.
         launcher: Where to trace.
@@ -91,11 +92,9 @@ class ReferenceStore:
         if samples < 1:
             raise OptionError(f"--spp is {samples}; give a number of at least 1")
         self.scene, self.width, self.height, self.seed = scene, width, height, seed
-        self.batch = min(BATCH, -(-samples // 2))
-        self.batches = 2 * -(-samples // (2 * self.batch))
-        self.samples = self.batch * self.batches
+        self.samples = 2 * -(-samples // 2)
         self.cache, self.launcher, self.quiet = cache, launcher, quiet
-        self._device_scene: Any = None
+        self._device_scene: DeviceScene | None = None
 
     def get(self, bounces: int) -> Reference:
         """The truth with ``bounces`` indirect bounces (0 is direct light only), from the cache if it is there.
@@ -106,6 +105,7 @@ class ReferenceStore:
         file = self.cache / f"{self.key(bounces)}.npz"
         reference = _load(file)
         if reference is None:
+            _make_folder(file.parent)  # found out before minutes of tracing
             reference = self._trace(bounces)
             _save(file, reference)
         return reference
@@ -115,7 +115,7 @@ class ReferenceStore:
         sha = hashlib.sha256()
         for part in _flatten(self.scene):
             sha.update(part)
-        numbers = (self.width, self.height, self.samples, self.batch, bounces, self.seed)
+        numbers = (self.width, self.height, self.samples, bounces, self.seed)
         sha.update(repr(numbers).encode() + source_digest(*TRACERS).encode())
         return sha.hexdigest()[:32]
 
@@ -125,38 +125,39 @@ class ReferenceStore:
         The scene is drawn once with white for glossy real surfaces and black for all others.
         """
         labelled = label_glossy(self.scene)
-        radiance = self._path_trace(self.launcher, self._upload(labelled), labelled, 1, 0, self.seed)
-        return radiance.albedo.numpy().reshape(self.height, self.width, 3)[..., 0] > 0.5
+        tracer = self._tracer(self._upload(labelled), labelled, 0, self.seed)
+        tracer.add(1)
+        return tracer.resolve().albedo.numpy().reshape(self.height, self.width, 3)[..., 0] > 0.5
 
     def _trace(self, bounces: int) -> Reference:
         if self._device_scene is None:
             self._device_scene = self._upload(self.scene)
-        shape = (self.height, self.width)
-        halves = [[np.zeros((*shape, n)) for n in (3, 3, 4)] for _ in range(2)]
+        halves = [self._tracer(self._device_scene, self.scene, bounces, seed) for seed in self._seeds()]
         title = f"truth {self.width}x{self.height}, {bounces} bounces"
         disable = True if self.quiet else None  # None: only on a terminal
         with tqdm(total=self.samples, desc=title, unit="spp", disable=disable, leave=False) as bar:
-            for k in range(self.batches):
-                seed = self.seed + 7919 * k
-                radiance = self._path_trace(self.launcher, self._device_scene, self.scene, self.batch, bounces, seed)
-                for total, array in zip(
-                    halves[k % 2], (radiance.before, radiance.delta, radiance.synthetic), strict=True
-                ):
-                    total += array.numpy().reshape(total.shape)
-                bar.update(self.batch)
-        means = [((a + b) / self.batches).astype(np.float32) for a, b in zip(*halves, strict=True)]
+            for tracer in halves:
+                while tracer.samples < self.samples // 2:
+                    done = tracer.samples
+                    tracer.add(min(tracer.samples_per_launch, self.samples // 2 - done))
+                    bar.update(tracer.samples - done)
+        (b1, d1, s1), (b2, d2, s2) = (self._pictures(tracer.resolve()) for tracer in halves)
+        before, delta, synthetic = (b1 + b2) / 2, (d1 + d2) / 2, (s1 + s2) / 2
         # Both halves on the same plate: a 'before' that two compared pictures share is no noise between them.
-        one, other = (combine(means[0], *(total * (2 / self.batches) for total in half[1:])) for half in halves)
-        return Reference(*means, noise=flip_ldr(one, other)[0] / 2)
+        noise = flip_ldr(combine(before, d1, s1), combine(before, d2, s2))[0] / 2
+        return Reference(before, delta, synthetic, noise)
 
-    def _path_trace(self, launcher, device_scene, scene, samples, bounces, seed):
-        from warp_dvct.methods.path_tracing import path_trace
+    def _seeds(self) -> tuple[int, int]:
+        return 2 * self.seed, 2 * self.seed + 1
 
-        return path_trace(
-            launcher, device_scene, scene, self.width, self.height, samples=samples, bounces=bounces, seed=seed
-        )
+    def _tracer(self, device_scene: DeviceScene, scene: Scene, bounces: int, seed: int) -> PathTracer:
+        return PathTracer(self.launcher, device_scene, scene, self.width, self.height, bounces=bounces, seed=seed)
 
-    def _upload(self, scene: Scene) -> Any:
+    def _pictures(self, radiance: Radiance) -> list[np.ndarray]:
+        arrays = (radiance.before, radiance.delta, radiance.synthetic)
+        return [a.numpy().reshape(self.height, self.width, -1).astype(np.float32) for a in arrays]
+
+    def _upload(self, scene: Scene) -> DeviceScene:
         bounds = scene.bounds()
         if bounds is None:
             raise StageError("the stage has no triangles to trace; check purposes and visibility")
@@ -249,13 +250,19 @@ def _load(file: Path) -> Reference | None:
     try:
         with np.load(file) as data:
             return Reference(data["before"], data["delta"], data["synthetic"], float(data["noise"]))
-    except (FileNotFoundError, zipfile.BadZipFile, KeyError, ValueError, EOFError):
+    except (OSError, zipfile.BadZipFile, KeyError, ValueError, EOFError):
         return None
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"the cache {folder} cannot be made: {error}; choose a folder with --cache") from error
 
 
 def _save(file: Path, reference: Reference) -> None:
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".tmp", delete=False) as out:
             np.savez_compressed(
                 out,
