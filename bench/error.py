@@ -136,9 +136,9 @@ def stage_file(stage: str) -> Path:
 
 def read(file: Path) -> Scene:
     """The stage's scene at its default time."""
-    from warp_dvct.usd.read import read_scene
+    from warp_dvct.usd.read import read_stage
 
-    return read_scene(file)
+    return read_stage(file)
 
 
 def _relight(

@@ -15,7 +15,7 @@ from warp_dvct.usd_scenes.usda import Vec3
 # The room: metres, x to the right, y up, the camera near the wall z = FRONT and looking along -z.
 SIDE, TOP, BACK, FRONT = 1.8, 2.2, -1.8, 2.2
 WHITE, RED, GREEN = (0.73, 0.73, 0.73), (0.63, 0.065, 0.05), (0.14, 0.45, 0.091)
-EYE, EYE_PITCH, EYE_ANGLE = (0.0, 1.15, 2.1), -12.0, 62.0
+EYE, EYE_PITCH, EYE_ANGLE = (0.0, 1.25, 2.1), -14.0, 60.0
 SUN_ANGLE = 1.0  # degrees
 
 
@@ -49,11 +49,11 @@ def room_spot() -> str:
         "Light",
         [
             f"float3[] extent = {usda.array([usda.vec((-0.06,) * 3), usda.vec((0.06,) * 3)])}",
-            "float inputs:intensity = 2200",
+            "float inputs:intensity = 1900",
             "float inputs:radius = 0.06",
-            "float inputs:shaping:cone:angle = 36",
-            "float inputs:shaping:cone:softness = 0.25",
-            *usda.place((-0.75, 2.05, 1.0), turn=-28, pitch=-62),
+            "float inputs:shaping:cone:angle = 40",
+            "float inputs:shaping:cone:softness = 0.5",
+            *usda.place((-0.9, 2.05, 0.9), turn=-38, pitch=-58),
         ],
         apis=["ShapingAPI"],
     )
@@ -67,13 +67,13 @@ def room_glossy() -> str:
         "Synthetic",
         "synthetic",
         [
-            usda.sphere("Ball", 0.3, (0.5, 0.3, 0.35), "Chrome"),
-            usda.box("Crate", (0.42, 0.62, 0.42), (-0.1, 0, -0.35), "Lacquer", turn=28),
+            usda.sphere("Ball", 0.25, (0.5, 0.25, -0.1), "Chrome"),
+            usda.box("Crate", (0.36, 0.56, 0.36), (-0.2, 0, -0.45), "Lacquer", turn=28),
         ],
     )
     glossy = [
-        usda.glossy("Floor", (0.55, 0.5, 0.45), roughness=0.2, metallic=0.4),
-        usda.glossy("Chrome", (0.9, 0.88, 0.85), roughness=0.12, metallic=1.0),
+        usda.glossy("Floor", (0.55, 0.5, 0.45), roughness=0.25, metallic=0.4),
+        usda.glossy("Chrome", (0.9, 0.88, 0.85), roughness=0.15, metallic=1.0),
         usda.glossy("Lacquer", (0.1, 0.2, 0.55), roughness=0.25),
     ]
     doc = (
@@ -89,7 +89,7 @@ def ground_dome() -> str:
         "DomeLight",
         "Sky",
         [
-            "float inputs:intensity = 1",
+            "float inputs:intensity = 0.75",
             "asset inputs:texture:file = @./sky.exr@",
             'token inputs:texture:format = "latlong"',
         ],
@@ -100,17 +100,17 @@ def ground_dome() -> str:
         [
             f"float inputs:angle = {usda.number(SUN_ANGLE)}",
             "color3f inputs:color = (1, 0.93, 0.82)",
-            "float inputs:intensity = 11000",
+            "float inputs:intensity = 13500",
             *usda.place(turn=-48, pitch=-42),
         ],
     )
     real = [
-        usda.quad("Ground", (-20, 0, 20), (40, 0, 0), (0, 0, -40), "Paving", uv_repeat=40),
+        usda.quad("Ground", (-40, 0, 40), (80, 0, 0), (0, 0, -80), "Paving", uv_repeat=80),
         usda.box("Block", (0.7, 0.9, 0.7), (-1.15, 0, -0.9), "Brick", turn=20),
     ]
     objects = [
-        usda.sphere("Ball", 0.42, (0.75, 0.42, 0.35), "White"),
-        usda.cylinder("Drum", 0.3, 0.8, (-0.2, 0, 0.1), "Teal"),
+        usda.sphere("Ball", 0.34, (0.7, 0.34, 0.2), "White"),
+        usda.cylinder("Drum", 0.24, 0.7, (-0.2, 0, -0.1), "Teal"),
     ]
     materials = [
         usda.textured_lambert("Paving", "paving.exr"),
@@ -119,7 +119,7 @@ def ground_dome() -> str:
         usda.lambert("Teal", (0.08, 0.4, 0.42)),
     ]
     children = [
-        usda.camera("Camera", (0.25, 1.7, 4.2), 0, -15, 48),
+        usda.camera("Camera", (0.15, 1.7, 4.0), 0, -13, 46),
         dome,
         sun,
         usda.role("Real", "real", real),
@@ -154,7 +154,7 @@ def bunny() -> str:
 
     The asset is a search path; ``usd_scenes.path("bunny")`` replaces it by the installed file.
     """
-    window = usda.rect_light("Light", 1.3, 1.3, 9, usda.place((-SIDE + 0.02, 1.35, 0.2), turn=-90))
+    window = usda.rect_light("Light", 1.3, 1.3, 8, usda.place((-SIDE + 0.02, 1.35, 0.2), turn=-90))
     scale = 0.42
     model = usda.prim(
         "Xform",
@@ -188,15 +188,15 @@ def room(floor: str = "White", furniture: str | None = None) -> str:
         usda.quad("LeftWall", (-SIDE, 0, FRONT), (0, 0, -d), (0, h, 0), "Red"),
         usda.quad("RightWall", (SIDE, 0, BACK), (0, 0, d), (0, h, 0), "Green"),
     ]
-    furniture = furniture or usda.box("Cupboard", (0.6, 1.2, 0.5), (-0.85, 0, -0.95), "White", turn=20)
+    furniture = furniture or usda.box("Cupboard", (0.6, 1.2, 0.5), (-1.05, 0, -1.1), "White", turn=20)
     return usda.role("Real", "real", [*walls, furniture])
 
 
 def diffuse_objects() -> str:
     """A white ball and a blue crate; synthetic."""
     objects = [
-        usda.sphere("Ball", 0.3, (0.5, 0.3, 0.35), "White"),
-        usda.box("Crate", (0.42, 0.62, 0.42), (-0.1, 0, -0.35), "Blue", turn=28),
+        usda.sphere("Ball", 0.25, (0.5, 0.25, -0.1), "White"),
+        usda.box("Crate", (0.36, 0.56, 0.36), (-0.2, 0, -0.45), "Blue", turn=28),
     ]
     return usda.role("Synthetic", "synthetic", objects)
 
@@ -208,7 +208,7 @@ def room_camera() -> str:
 
 def ceiling_light() -> str:
     """A square light just below the ceiling."""
-    return usda.rect_light("Light", 0.9, 0.9, 11, usda.place((0, TOP - 0.01, 0.1), pitch=-90))
+    return usda.rect_light("Light", 0.9, 0.9, 13, usda.place((0, TOP - 0.01, 0.1), pitch=-90))
 
 
 def room_materials(more: list[str] | None = None) -> str:
@@ -218,15 +218,15 @@ def room_materials(more: list[str] | None = None) -> str:
 
 
 def sky(width: int = 128, height: int = 64) -> np.ndarray:
-    """A clear sky in UsdLux's lat-long layout: pale at the horizon, blue above, brighter towards the sun's side."""
+    """A clear sky in UsdLux's lat-long layout: pale at the horizon, blue above, grey below, brighter around the sun."""
     elevation = (0.5 - (np.arange(height) + 0.5) / height) * np.pi
     around = (np.arange(width) + 0.5) / width * 2 * np.pi
     up = np.clip(np.sin(elevation), 0, 1)[:, None, None]
+    down = np.clip(-elevation / 0.4, 0, 1)[:, None, None]
     horizon, zenith, below = np.array([0.72, 0.78, 0.85]), np.array([0.16, 0.31, 0.66]), np.array([0.2, 0.18, 0.16])
-    colour = horizon + (zenith - horizon) * up**0.45
+    colour = np.where(down > 0, horizon + (below - horizon) * down, horizon + (zenith - horizon) * up**0.45)
     glow = 1 + 0.35 * np.cos(around - 3.98)[None, :, None] * np.cos(elevation)[:, None, None]
-    pixels = np.where(elevation[:, None, None] > 0, colour * glow, below)
-    return np.broadcast_to(pixels, (height, width, 3)).astype(np.float16)
+    return np.broadcast_to(colour * glow, (height, width, 3)).astype(np.float16)
 
 
 def paving(size: int = 64) -> np.ndarray:
