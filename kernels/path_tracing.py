@@ -373,17 +373,14 @@ def _resolve_pixels(
     synthetic_out: wp.array(dtype=wp.vec4),
     mask_real_out: wp.array(dtype=float),
 ):
-    """Sums to means; the delta is a mean over the samples that saw no synthetic surface."""
+    """Sums to means over the whole pixel; the delta holds only the samples that saw no synthetic surface."""
     i = first + wp.tid()
     total = wp.float64(samples)
     synthetic = synthetic_in[i]
-    without = total - synthetic[3]
     before_out[i] = wp.vec3(before_in[i] / total)
     synthetic_out[i] = wp.vec4(synthetic / total)
     mask_real_out[i] = float(real_in[i]) / float(samples)
-    delta_out[i] = wp.vec3(0.0, 0.0, 0.0)
-    if without > wp.float64(0.0):
-        delta_out[i] = wp.vec3(delta_in[i] / without)
+    delta_out[i] = wp.vec3(delta_in[i] / total)
 
 
 @wp.kernel

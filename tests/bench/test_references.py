@@ -125,6 +125,19 @@ def test_truth_is_what_it_says(make_store):
     np.testing.assert_allclose(truth.comp[truth.coverage == 1], truth.synthetic[..., :3][truth.coverage == 1])
 
 
+def test_delta_at_silhouettes_is_weighted_by_the_real_part(make_store):
+    """No more light can be lost than the visible part of the floor had: else objects get a black rim."""
+    truth = make_store(samples=256).get(0)
+    lit = 0.6 / np.pi * (2 * 0.8 + 0.3 * np.pi)
+    part = (1 - truth.coverage)[..., None]
+    rim = (part > 0) & (part < 1)
+    assert rim.sum() > 10
+    assert (np.where(rim, truth.delta, 0) >= -1.02 * lit * part).all()
+    assert (np.where(rim, truth.delta / np.maximum(part, 1e-6), 0) < -0.5 * lit).any(), (
+        "a rim in the shadow is among them"
+    )
+
+
 def test_noise_falls_with_samples(make_store):
     assert make_store(samples=64).get(1).noise < 0.7 * make_store(samples=4).get(1).noise
 
