@@ -173,13 +173,21 @@ def _unit(normals: np.ndarray | None, points: np.ndarray, topology: Topology) ->
 
 
 def _smooth(points: np.ndarray, topology: Topology) -> np.ndarray:
-    """Area-weighted point normals; at a crease a corner keeps its own face's normal."""
+    """Point normals weighted by the corners' angles; at a crease a corner keeps its own face's normal.
+
+    Angles do not depend on how a face was cut into triangles (Thuermer and Wuethrich 1998).
+    """
     triangles = topology.triangles
     face = _face_normals(points, triangles)
-    flat = triangles.reshape(-1)
-    summed = np.stack([np.bincount(flat, np.repeat(face[:, k], 3), len(points)) for k in range(3)], 1)
-    summed /= np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-300)
     face /= np.linalg.norm(face, axis=1, keepdims=True)
+    summed = np.zeros((len(points), 3))
+    for k in range(3):
+        at = points[triangles[:, k]]
+        a, b = points[triangles[:, (k + 1) % 3]] - at, points[triangles[:, (k + 2) % 3]] - at
+        angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("tk,tk->t", a, b))
+        for axis in range(3):
+            summed[:, axis] += np.bincount(triangles[:, k], face[:, axis] * angle, len(points))
+    summed /= np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-300)
     corners = summed[triangles]
     soft = np.einsum("tck,tk->tc", corners, face) >= CREASE_COSINE
     return np.where(soft[..., None], corners, face[:, None])

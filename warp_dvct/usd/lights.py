@@ -167,7 +167,7 @@ def _disk(e: _Emitter, value: np.ndarray, common: dict[str, Any]) -> Light:
 
 
 def _distant(e: _Emitter, value: np.ndarray, common: dict[str, Any]) -> Light:
-    """``normalize`` divides by pi sin^2(angle / 2): ``intensity`` is then the irradiance on a plane facing the light."""
+    """``normalize`` divides by pi sin^2(angle / 2): ``intensity`` is then the irradiance of a plane facing it."""
     degrees = float(e.get("inputs:angle"))
     if not (0.0 <= degrees <= 360.0):
         raise StageError(f"{e.path}: angle is {degrees}; give 0 to 360 degrees")

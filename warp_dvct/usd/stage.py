@@ -101,7 +101,7 @@ def frame_range(source: str | Path | Usd.Stage) -> tuple[float, float, float] | 
     return stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetFramesPerSecond()
 
 
-def _open_unloaded(source: str | Path) -> Usd.Stage:
+def _open_unloaded(source: str | os.PathLike) -> Usd.Stage:
     from pxr import Sdf, Tf, Usd
 
     name = os.fspath(source)

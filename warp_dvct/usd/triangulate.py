@@ -119,20 +119,22 @@ def _cross2(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _find_ear(ring: np.ndarray, turn: np.ndarray) -> int | None:
-    """A convex corner whose triangle holds no reflex corner; a flat corner is cut off first (it has no area)."""
-    scale = np.abs(turn).max()
-    flat = np.abs(turn) <= FAN_TOLERANCE * scale
-    if flat.any():
-        return int(np.argmax(flat))
-    reflex = ring[turn < 0]
+    """A convex corner whose triangle holds no other corner; failing that a flat corner, which has no area.
+
+    Flat corners hold back an ear as reflex ones do: cut past one, and it would lie on an edge as a T-junction.
+    """
+    flat = np.abs(turn) <= FAN_TOLERANCE * np.abs(turn).max()
+    blockers = ring[(turn < 0) | flat]
     # Corners in order of their sharpness would give nicer triangles; in ring order the result is stable.
-    for i in np.nonzero(turn > 0)[0]:
+    for i in np.nonzero((turn > 0) & ~flat)[0]:
         a, b, c = ring[i - 1], ring[i], ring[(i + 1) % len(ring)]
         # A corner at the same place as one of the ear's is the other end of a doubled edge, and does no harm.
-        other = reflex[~((reflex == a).all(1) | (reflex == b).all(1) | (reflex == c).all(1))]
+        other = blockers[~((blockers == a).all(1) | (blockers == b).all(1) | (blockers == c).all(1))]
         inside = (_cross2(b - a, other - a) >= 0) & (_cross2(c - b, other - b) >= 0) & (_cross2(a - c, other - c) >= 0)
         if not inside.any():
             return int(i)
+    if flat.any():
+        return int(np.argmax(flat))
     return None
 
 
