@@ -9,6 +9,11 @@ wp.set_module_options({"enable_backward": False})
 OPAQUE = wp.constant(0.999)  # a march ends when this share of the cone is covered in both solutions
 
 
+DUAL = wp.constant(0)
+SPLIT = wp.constant(1)
+SPLIT_WITH_BEFORE = wp.constant(2)  # the same; the caller marches once more for the light before
+
+
 @wp.struct
 class ConeSettings:
     aperture: float  # full opening angle [rad]
@@ -16,7 +21,7 @@ class ConeSettings:
     start: float  # first sample's distance, in level-0 voxels
     reach: float  # farthest distance, in volume space
     additive: int  # 1: coverage adds up (surfaces); 0: eq. 4's product of transparencies
-    split: int  # 1: the paper's single occupancy, with the field's difference in ``before``
+    split: int  # DUAL, or the paper's single occupancy with the field's difference in ``before``
 
 
 @wp.struct
@@ -125,7 +130,7 @@ def march_cone(
                 searching = inside_box(coarse, middle)
         else:
             searching = False
-        if cone.split != 0:
+        if cone.split != DUAL:
             delta = value.after - value.before
             value.before = wp.vec4(delta[0], delta[1], delta[2], value.after[3])
         total.before = accumulate(total.before, value.before, cone.step, cone.additive)

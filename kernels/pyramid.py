@@ -50,9 +50,9 @@ def _light_faces(
                 field_out[(i * 6 + face) * 2 + solution] = value
     else:
         for face in range(6):
-            area = area_in[i * 6 + face]
-            field_out[(i * 6 + face) * 2] = radiosity_face(flux_in[(i * 6 + face) * 2], area[0])
-            field_out[(i * 6 + face) * 2 + 1] = radiosity_face(flux_in[(i * 6 + face) * 2 + 1], area[1])
+            shown = area_in[i * 6 + face]
+            field_out[(i * 6 + face) * 2] = radiosity_face(flux_in[(i * 6 + face) * 2], shown[0])
+            field_out[(i * 6 + face) * 2 + 1] = radiosity_face(flux_in[(i * 6 + face) * 2 + 1], shown[1])
 
 
 @wp.func

@@ -1,0 +1,321 @@
+"""Second and further bounces by re-injection: a radiosity solution on patches, added to the voxels' flux.
+
+A patch is the largest piece of surface behind one face of a voxel of a coarse level. Its rays are traced once; every
+further bounce only follows the links from patch to patch.
+"""
+
+import warp as wp
+
+from warp_dvct.kernels.gather import World, radiosity_at
+from warp_dvct.kernels.geometry import FAR, Geometry, Hit, corner_position, trace_real, trace_synthetic
+from warp_dvct.kernels.materials import Materials, Surface, hemispherical_albedo, spawn_point, surface_at
+from warp_dvct.kernels.sampling import cosine_hemisphere, from_frame, sobol2
+from warp_dvct.kernels.volume import Volume, brick_extent, face_of, face_weight, find_record, key_cell
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def fragment_surface(geo: Geometry, mats: Materials, triangle: int, position: wp.vec3, direction: wp.vec3) -> Surface:
+    """The surface of a triangle at a point on it, seen along ``direction``."""
+    a = corner_position(geo, triangle, 0)
+    b = corner_position(geo, triangle, 1)
+    c = corner_position(geo, triangle, 2)
+    n = wp.cross(b - a, c - a)
+    size = wp.max(wp.dot(n, n), 1.0e-30)
+    hit = Hit()
+    hit.found = 1
+    hit.triangle = triangle
+    hit.u = wp.clamp(wp.dot(wp.cross(c - b, position - b), n) / size, 0.0, 1.0)
+    hit.v = wp.clamp(wp.dot(wp.cross(a - c, position - c), n) / size, 0.0, 1.0 - hit.u)
+    hit.synthetic = wp.where(triangle >= geo.synthetic_first, 1, 0)
+    return surface_at(geo, mats, hit, position - direction, direction)
+
+
+@wp.kernel
+def _mean_albedo(
+    first: int,
+    geo: Geometry,
+    mats: Materials,
+    normal_in: wp.array(dtype=wp.vec3),
+    record_start_in: wp.array(dtype=wp.int32),
+    order_in: wp.array(dtype=wp.int32),
+    triangle_in: wp.array(dtype=wp.int32),
+    fragment_in: wp.array(dtype=wp.vec4),
+    fragments: int,
+    records: int,
+    albedo_out: wp.array(dtype=wp.vec3),
+):
+    """Area-weighted albedo of a record's surfaces, before and after."""
+    i = first + wp.tid()
+    end = fragments
+    if i + 1 < records:
+        end = record_start_in[i + 1]
+    real = wp.vec3(0.0, 0.0, 0.0)
+    every = wp.vec3(0.0, 0.0, 0.0)
+    real_area = float(0.0)
+    area = float(0.0)
+    for j in range(record_start_in[i], end):
+        fragment = order_in[j]
+        triangle = triangle_in[fragment]
+        place = fragment_in[fragment]
+        s = fragment_surface(geo, mats, triangle, wp.vec3(place[0], place[1], place[2]), -normal_in[triangle])
+        albedo = hemispherical_albedo(s) * place[3]
+        every += albedo
+        area += place[3]
+        if triangle < geo.synthetic_first:
+            real += albedo
+            real_area += place[3]
+    albedo_out[2 * i] = real / wp.max(real_area, 1.0e-20)
+    albedo_out[2 * i + 1] = every / wp.max(area, 1.0e-20)
+
+
+@wp.kernel
+def _face_keys(
+    first: int,
+    key_in: wp.array(dtype=wp.int32),
+    area_in: wp.array(dtype=wp.vec2),
+    volume: Volume,
+    level: int,
+    level_first: int,
+    empty: int,
+    key_out: wp.array(dtype=wp.int32),
+):
+    """For each face of a level-0 record: the face of the voxel of ``level`` that holds it."""
+    i = first + wp.tid()
+    cell = key_cell(key_in[i / 6], brick_extent(volume.n, 0))
+    key = empty
+    if area_in[i][1] > 0.0:
+        record = find_record(volume, level, cell[0] >> level, cell[1] >> level, cell[2] >> level)
+        key = (record - level_first) * 6 + i % 6
+    key_out[i] = key
+
+
+@wp.struct
+class Patches:
+    position: wp.array(dtype=wp.vec3)
+    normal: wp.array(dtype=wp.vec3)
+    albedo: wp.array(dtype=wp.vec3)
+    reach: wp.array(dtype=wp.float32)
+    real: wp.array(dtype=wp.int32)
+
+
+@wp.kernel
+def _choose_patches(
+    first: int,
+    geo: Geometry,
+    mats: Materials,
+    normal_in: wp.array(dtype=wp.vec3),
+    face_key_in: wp.array(dtype=wp.int32),
+    start_in: wp.array(dtype=wp.int32),
+    face_order_in: wp.array(dtype=wp.int32),
+    entries: int,
+    runs: int,
+    area_in: wp.array(dtype=wp.vec2),
+    record_start_in: wp.array(dtype=wp.int32),
+    order_in: wp.array(dtype=wp.int32),
+    triangle_in: wp.array(dtype=wp.int32),
+    fragment_in: wp.array(dtype=wp.vec4),
+    fragments: int,
+    records: int,
+    patches_out: Patches,
+    table_out: wp.array(dtype=wp.int32),
+):
+    """The largest fragment behind each occupied face becomes its patch."""
+    i = first + wp.tid()
+    end = entries
+    if i + 1 < runs:
+        end = start_in[i + 1]
+    best = int(-1)
+    most = float(-1.0)
+    for j in range(start_in[i], end):
+        area = area_in[face_order_in[j]][1]
+        if area > most:
+            most = area
+            best = face_order_in[j]
+    face = best % 6
+    record = best / 6
+    stop = fragments
+    if record + 1 < records:
+        stop = record_start_in[record + 1]
+    chosen = int(-1)
+    most = float(-1.0)
+    for j in range(record_start_in[record], stop):
+        fragment = order_in[j]
+        normal = normal_in[triangle_in[fragment]]
+        shown = face_weight(normal, face)
+        if geo.double_sided[triangle_in[fragment]] != 0:
+            shown = wp.max(shown, face_weight(-normal, face))
+        if shown * fragment_in[fragment][3] > most:
+            most = shown * fragment_in[fragment][3]
+            chosen = fragment
+    triangle = triangle_in[chosen]
+    normal = normal_in[triangle]
+    normal = wp.where(face_weight(normal, face) > 0.0, normal, -normal)
+    place = fragment_in[chosen]
+    s = fragment_surface(geo, mats, triangle, wp.vec3(place[0], place[1], place[2]), -normal)
+    patches_out.position[i] = s.position
+    patches_out.normal[i] = normal
+    patches_out.albedo[i] = hemispherical_albedo(s)
+    patches_out.reach[i] = s.reach
+    patches_out.real[i] = 1 - s.synthetic
+    table_out[face_key_in[i]] = i
+
+
+@wp.func
+def patch_at(
+    volume: Volume, level: int, level_first: int, table: wp.array(dtype=wp.int32), position: wp.vec3, normal: wp.vec3
+) -> int:
+    """The patch of a surface point: behind the face that its normal shows on most, then on less; -1 for none."""
+    size = volume.voxel * float(1 << level)
+    local = (position - volume.low) / size
+    record = find_record(volume, level, int(wp.floor(local[0])), int(wp.floor(local[1])), int(wp.floor(local[2])))
+    if record < 0:
+        return -1
+    best = int(-1)
+    most = float(0.0)
+    for axis in range(3):
+        share = wp.abs(normal[axis])
+        patch = table[(record - level_first) * 6 + face_of(axis, normal[axis])]
+        if patch >= 0 and share > most:
+            most = share
+            best = patch
+    return best
+
+
+@wp.kernel
+def _link_patches(
+    first: int,
+    geo: Geometry,
+    world: World,
+    patches: Patches,
+    volume: Volume,
+    level: int,
+    level_first: int,
+    table_in: wp.array(dtype=wp.int32),
+    rays: int,
+    seed: int,
+    link_out: wp.array(dtype=wp.vec2i),
+    irradiance_out: wp.array(dtype=wp.vec3),
+):
+    """Trace a patch's rays: where they end (before, after), and the first bounce's irradiance."""
+    i = first + wp.tid()
+    normal = patches.normal[i]
+    s = Surface()
+    s.position = patches.position[i]
+    s.normal_g = normal
+    s.reach = patches.reach[i]
+    before = wp.vec3(0.0, 0.0, 0.0)
+    after = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(rays):
+        direction = from_frame(cosine_hemisphere(sobol2(seed, i, k, 23)), normal)
+        origin = spawn_point(s, direction)
+        real = trace_real(geo, origin, direction, FAR)
+        synthetic = trace_synthetic(geo, origin, direction, real.t)
+        link = wp.vec2i(-1, -1)
+        if real.found != 0:
+            n = world.normals[real.triangle]
+            n = wp.where(wp.dot(n, direction) > 0.0, -n, n)
+            position = origin + direction * real.t
+            light = radiosity_at(world, position, n)
+            before += light.before
+            link[0] = patch_at(volume, level, level_first, table_in, position, n)
+            if synthetic.found == 0:
+                after += light.after
+                link[1] = link[0]
+        if synthetic.found != 0:
+            n = world.normals[synthetic.triangle]
+            n = wp.where(wp.dot(n, direction) > 0.0, -n, n)
+            position = origin + direction * synthetic.t
+            light = radiosity_at(world, position, n)
+            after += light.after
+            link[1] = patch_at(volume, level, level_first, table_in, position, n)
+        link_out[i * rays + k] = link
+    irradiance_out[2 * i] = before / float(rays)
+    irradiance_out[2 * i + 1] = after / float(rays)
+
+
+@wp.kernel
+def _bounce(
+    first: int,
+    patches: Patches,
+    link_in: wp.array(dtype=wp.vec2i),
+    rays: int,
+    irradiance_in: wp.array(dtype=wp.vec3),
+    irradiance_out: wp.array(dtype=wp.vec3),
+    total_out: wp.array(dtype=wp.vec3),
+):
+    """The next bounce's irradiance from the last one's, along the links; ``total_out`` collects all bounces."""
+    i = first + wp.tid()
+    before = wp.vec3(0.0, 0.0, 0.0)
+    after = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(rays):
+        link = link_in[i * rays + k]
+        if link[0] >= 0:
+            if patches.real[link[0]] != 0:
+                before += wp.cw_mul(patches.albedo[link[0]], irradiance_in[2 * link[0]])
+        if link[1] >= 0:
+            after += wp.cw_mul(patches.albedo[link[1]], irradiance_in[2 * link[1] + 1])
+    before = before / float(rays)
+    after = after / float(rays)
+    irradiance_out[2 * i] = before
+    irradiance_out[2 * i + 1] = after
+    total_out[2 * i] += before
+    total_out[2 * i + 1] += after
+
+
+@wp.kernel
+def _reinject(
+    first: int,
+    key_in: wp.array(dtype=wp.int32),
+    target: Volume,
+    area_in: wp.array(dtype=wp.vec2),
+    albedo_in: wp.array(dtype=wp.vec3),
+    volume: Volume,
+    level: int,
+    level_first: int,
+    table_in: wp.array(dtype=wp.int32),
+    patches: Patches,
+    total_in: wp.array(dtype=wp.vec3),
+    flux_out: wp.array(dtype=wp.vec3),
+):
+    """Add the bounces to a record's faces: patches of the same face around it, trilinear over the patches' level."""
+    i = first + wp.tid()
+    cell = key_cell(key_in[i], brick_extent(target.n, 0))
+    center = wp.vec3(float(cell[0]) + 0.5, float(cell[1]) + 0.5, float(cell[2]) + 0.5) * target.voxel + target.low
+    local = (center - volume.low) / (volume.voxel * float(1 << level)) - wp.vec3(0.5, 0.5, 0.5)
+    x0 = int(wp.floor(local[0]))
+    y0 = int(wp.floor(local[1]))
+    z0 = int(wp.floor(local[2]))
+    for face in range(6):
+        area = area_in[i * 6 + face]
+        if area[1] > 0.0:
+            before = wp.vec3(0.0, 0.0, 0.0)
+            after = wp.vec3(0.0, 0.0, 0.0)
+            weight_before = float(0.0)
+            weight_after = float(0.0)
+            for corner in range(8):
+                dx = corner & 1
+                dy = (corner >> 1) & 1
+                dz = corner >> 2
+                record = find_record(volume, level, x0 + dx, y0 + dy, z0 + dz)
+                if record >= 0:
+                    patch = table_in[(record - level_first) * 6 + face]
+                    if patch >= 0:
+                        fx = local[0] - float(x0)
+                        fy = local[1] - float(y0)
+                        fz = local[2] - float(z0)
+                        weight = (
+                            wp.where(dx == 1, fx, 1.0 - fx)
+                            * wp.where(dy == 1, fy, 1.0 - fy)
+                            * wp.where(dz == 1, fz, 1.0 - fz)
+                        ) + 1.0e-4
+                        after += total_in[2 * patch + 1] * weight
+                        weight_after += weight
+                        if patches.real[patch] != 0:
+                            before += total_in[2 * patch] * weight
+                            weight_before += weight
+            if weight_before > 0.0:
+                flux_out[(i * 6 + face) * 2] += wp.cw_mul(albedo_in[2 * i], before) * (area[0] / weight_before)
+            if weight_after > 0.0:
+                flux_out[(i * 6 + face) * 2 + 1] += wp.cw_mul(albedo_in[2 * i + 1], after) * (area[1] / weight_after)

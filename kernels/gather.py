@@ -1,0 +1,533 @@
+"""Indirect light at shading points: cones or exact rays into the radiosity volume, and guided reconstruction."""
+
+import warp as wp
+
+from warp_dvct.kernels.cones import DUAL, SPLIT_WITH_BEFORE, ConeSettings, march_cone
+from warp_dvct.kernels.environment import Environment, environment_radiance
+from warp_dvct.kernels.gbuffer import BACKGROUND, SYNTHETIC, Points, load_surface
+from warp_dvct.kernels.geometry import FAR, Geometry, trace_real, trace_synthetic
+from warp_dvct.kernels.lights import ADDED, DOME, Lights, light_along_ray
+from warp_dvct.kernels.materials import (
+    Surface,
+    brdf_cos_specular,
+    fresnel,
+    ggx_sample_half,
+    hemispherical_albedo_specular,
+    spawn_point,
+)
+from warp_dvct.kernels.sampling import INV_PI, PI, cosine_hemisphere, from_frame, sobol2, tangent_of, uniform1
+from warp_dvct.kernels.shading import vndf_pdf
+from warp_dvct.kernels.volume import Volume, face_of, find_record
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class World:
+    """What gathered rays and cones read."""
+
+    fine: Volume
+    coarse: Volume
+    has_coarse: wp.int32
+    env: Environment
+    normals: wp.array(dtype=wp.vec3)  # unit geometric normals of all triangles
+
+
+@wp.struct
+class Incident:
+    """Radiosity (pi times radiance) of the two solutions, and how far away they were met."""
+
+    before: wp.vec3
+    after: wp.vec3
+    distance_before: wp.float32
+    distance_after: wp.float32
+
+
+@wp.struct
+class FieldPair:
+    before: wp.vec4
+    after: wp.vec4
+
+
+@wp.func
+def field_pair(volume: Volume, position: wp.vec3, normal: wp.vec3) -> FieldPair:
+    """Both solutions of the level-0 faces around a surface point, trilinear, weighted by the surface's normal."""
+    local = (position - volume.low) / volume.voxel - wp.vec3(0.5, 0.5, 0.5)
+    x0 = int(wp.floor(local[0]))
+    y0 = int(wp.floor(local[1]))
+    z0 = int(wp.floor(local[2]))
+    fx = local[0] - float(x0)
+    fy = local[1] - float(y0)
+    fz = local[2] - float(z0)
+    total = FieldPair()
+    total.before = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    total.after = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    for corner in range(8):
+        dx = corner & 1
+        dy = (corner >> 1) & 1
+        dz = corner >> 2
+        record = find_record(volume, 0, x0 + dx, y0 + dy, z0 + dz)
+        if record >= 0:
+            weight = wp.where(dx == 1, fx, 1.0 - fx) * wp.where(dy == 1, fy, 1.0 - fy) * wp.where(dz == 1, fz, 1.0 - fz)
+            for axis in range(3):
+                share = wp.abs(normal[axis])
+                if share > 0.01:
+                    at = record * 12 + 2 * face_of(axis, normal[axis])
+                    total.before += (weight * share) * volume.field[at]
+                    total.after += (weight * share) * volume.field[at + 1]
+    return total
+
+
+@wp.func
+def ratio(value: wp.vec4) -> wp.vec3:
+    if value[3] <= 1.0e-6:
+        return wp.vec3(0.0, 0.0, 0.0)
+    return wp.vec3(value[0], value[1], value[2]) / value[3]
+
+
+@wp.func
+def radiosity_at(world: World, position: wp.vec3, normal: wp.vec3) -> Incident:
+    """Radiosity of a surface point from the fine volume, or the coarse one where the fine one does not reach."""
+    fine = field_pair(world.fine, position, normal)
+    if world.has_coarse != 0 and fine.after[3] <= 1.0e-6:
+        fine = field_pair(world.coarse, position, normal)
+    result = Incident()
+    result.before = ratio(fine.before)
+    result.after = ratio(fine.after)
+    return result
+
+
+@wp.func
+def ray_incident(world: World, geo: Geometry, origin: wp.vec3, direction: wp.vec3, solid_angle: float) -> Incident:
+    """Light along an exact ray, before and after: the hit voxel's radiosity, or the environment's."""
+    result = Incident()
+    result.before = wp.vec3(0.0, 0.0, 0.0)
+    result.after = wp.vec3(0.0, 0.0, 0.0)
+    real = trace_real(geo, origin, direction, FAR)
+    synthetic = trace_synthetic(geo, origin, direction, real.t)
+    if real.found != 0:
+        n = world.normals[real.triangle]
+        n = wp.where(wp.dot(n, direction) > 0.0, -n, n)
+        result = radiosity_at(world, origin + direction * real.t, n)
+    elif world.env.levels > 0:
+        result.before = environment_radiance(world.env, direction, solid_angle, 0) * PI
+        result.after = environment_radiance(world.env, direction, solid_angle, 1) * PI
+    if synthetic.found != 0:
+        n = world.normals[synthetic.triangle]
+        n = wp.where(wp.dot(n, direction) > 0.0, -n, n)
+        inserted = radiosity_at(world, origin + direction * synthetic.t, n)
+        result.after = inserted.after
+    result.distance_before = real.t
+    result.distance_after = synthetic.t
+    return result
+
+
+@wp.func
+def escaped(world: World, direction: wp.vec3, aperture: float, solution: int) -> wp.vec3:
+    """The environment as a cone reads it, times pi."""
+    return environment_radiance(world.env, direction, 2.0 * PI * (1.0 - wp.cos(0.5 * aperture)), solution) * PI
+
+
+@wp.func
+def rgb(value: wp.vec4) -> wp.vec3:
+    return wp.vec3(value[0], value[1], value[2])
+
+
+@wp.func
+def cone_incident(world: World, origin: wp.vec3, direction: wp.vec3, cone: ConeSettings, real: int) -> Incident:
+    """Light along a cone, before and after; what escapes reads the prefiltered environment.
+
+    In the paper's form (``cone.split``), ``after - before`` at a real surface is the march through the delta field
+    alone; ``before`` is then 0 unless it was asked for by a second march.
+    """
+    march = march_cone(world.fine, world.coarse, world.has_coarse, origin, direction, cone)
+    free_after = wp.max(0.0, 1.0 - march.after[3])
+    result = Incident()
+    if cone.split == DUAL or real == 0:
+        result.before = rgb(march.before) + escaped(world, direction, cone.aperture, 0) * wp.max(0.0, 1.0 - march.before[3])
+        result.after = rgb(march.after) + escaped(world, direction, cone.aperture, 1) * free_after
+    else:
+        added = escaped(world, direction, cone.aperture, 1) - escaped(world, direction, cone.aperture, 0)
+        result.before = wp.vec3(0.0, 0.0, 0.0)
+        if cone.split == SPLIT_WITH_BEFORE:
+            shaft = cone
+            shaft.split = DUAL
+            alone = march_cone(world.fine, world.coarse, world.has_coarse, origin, direction, shaft)
+            result.before = rgb(alone.before) + escaped(world, direction, cone.aperture, 0) * wp.max(0.0, 1.0 - alone.before[3])
+        result.after = result.before + rgb(march.before) + added * free_after
+    return result
+
+
+@wp.kernel
+def _choose_points(
+    first: int,
+    points: Points,
+    width: int,
+    height: int,
+    stride: int,
+    columns: int,
+    role: int,
+    seed: int,
+    choice_out: wp.array(dtype=wp.int32),
+):
+    """The pixel that stands for a ``stride`` x ``stride`` block: a hashed one if it has the role, else the next that
+    has; -1 where none has."""
+    i = first + wp.tid()
+    bx = (i % columns) * stride
+    by = (i / columns) * stride
+    cells = stride * stride
+    start = int(uniform1(seed, i, 0, 7) * float(cells))
+    found = int(-1)
+    for k in range(cells):
+        if found < 0:
+            cell = (start + k) % cells
+            x = bx + cell % stride
+            y = by + cell / stride
+            if x < width and y < height:
+                if points.role[y * width + x] == role:
+                    found = y * width + x
+    choice_out[i] = found
+
+
+@wp.kernel
+def _gather_rays(
+    first: int,
+    points: Points,
+    index_in: wp.array(dtype=wp.int32),
+    geo: Geometry,
+    world: World,
+    rays: int,
+    seed: int,
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+):
+    """Irradiance [W m^-2] from indirect light and domes, by cosine-distributed exact rays (eq. 6's integral)."""
+    i = first + wp.tid()
+    j = index_in[i]
+    before = wp.vec3(0.0, 0.0, 0.0)
+    after = wp.vec3(0.0, 0.0, 0.0)
+    if j >= 0:
+        if points.role[j] != BACKGROUND:
+            s = load_surface(points, j)
+            for k in range(rays):
+                local = cosine_hemisphere(sobol2(seed, j, k, 11))
+                direction = from_frame(local, s.normal)
+                solid_angle = PI / (float(rays) * wp.max(local[2], 0.05))
+                if wp.dot(direction, s.normal_g) > 0.0:
+                    light = ray_incident(world, geo, spawn_point(s, direction), direction, solid_angle)
+                    before += light.before
+                    after += light.after
+    before_out[i] = before / float(rays)
+    after_out[i] = after / float(rays)
+
+
+@wp.kernel
+def _gather_cones(
+    first: int,
+    points: Points,
+    index_in: wp.array(dtype=wp.int32),
+    world: World,
+    cones: int,
+    cone: ConeSettings,
+    seed: int,
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+):
+    """Irradiance [W m^-2] by ``cones`` cones of equal cosine-weighted solid angle (eq. 6's first sum).
+
+    Directions follow a cosine-weighted spiral turned by a random angle per point; each cone's aperture is that of its
+    solid angle, pi / (cones * cos), unless ``cone.aperture`` sets it.
+    """
+    i = first + wp.tid()
+    j = index_in[i]
+    before = wp.vec3(0.0, 0.0, 0.0)
+    after = wp.vec3(0.0, 0.0, 0.0)
+    if j >= 0:
+        if points.role[j] != BACKGROUND:
+            s = load_surface(points, j)
+            turn = 2.0 * PI * uniform1(seed, j, 0, 13)
+            origin = s.position + s.normal_g * (cone.start * world.fine.voxel)
+            for k in range(cones):
+                sine2 = (float(k) + 0.5) / float(cones)
+                phi = 2.399963 * float(k) + turn
+                cos = wp.sqrt(1.0 - sine2)
+                sine = wp.sqrt(sine2)
+                direction = from_frame(wp.vec3(sine * wp.cos(phi), sine * wp.sin(phi), cos), s.normal)
+                shaft = cone
+                if cone.aperture <= 0.0:
+                    height = wp.min(0.5 / (float(cones) * wp.max(cos, 0.1)), 1.0)
+                    shaft.aperture = 2.0 * wp.acos(1.0 - height)
+                light = cone_incident(world, origin, direction, shaft, wp.where(points.role[j] == SYNTHETIC, 0, 1))
+                before += light.before
+                after += light.after
+    before_out[i] = before / float(cones)
+    after_out[i] = after / float(cones)
+
+
+@wp.struct
+class Guide:
+    """How far a gathered point may lend its irradiance to another."""
+
+    stride: wp.int32
+    columns: wp.int32
+    rows: wp.int32
+    radius: wp.int32  # blocks to each side
+    plane: wp.float32  # tolerated distance off the tangent plane, in pixel footprints times stride
+    sharpness: wp.float32  # exponent of the normals' cosine
+
+
+@wp.kernel
+def _reconstruct(
+    first: int,
+    points: Points,
+    pixel_in: wp.array(dtype=wp.int32),
+    width: int,
+    role: int,
+    guide: Guide,
+    choice_in: wp.array(dtype=wp.int32),
+    before_in: wp.array(dtype=wp.vec3),
+    after_in: wp.array(dtype=wp.vec3),
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+    missing_out: wp.array(dtype=wp.int32),
+):
+    """Irradiance of every point of a role from the gathered ones around, weighted by distance, plane and normal.
+
+    ``missing_out`` is 1 where none of them lies on the same surface.
+    """
+    i = first + wp.tid()
+    missing = int(0)
+    if points.role[i] == role:
+        pixel = pixel_in[i]
+        px = float(pixel % width) + 0.5
+        py = float(pixel / width) + 0.5
+        stride = float(guide.stride)
+        cx = int(wp.floor(px / stride))
+        cy = int(wp.floor(py / stride))
+        position = points.position[i]
+        normal_g = points.normal_g[i]
+        normal = points.normal[i]
+        reach = guide.plane * stride * points.footprint[i]
+        total = float(0.0)
+        before = wp.vec3(0.0, 0.0, 0.0)
+        after = wp.vec3(0.0, 0.0, 0.0)
+        for by in range(wp.max(cy - guide.radius, 0), wp.min(cy + guide.radius, guide.rows - 1) + 1):
+            for bx in range(wp.max(cx - guide.radius, 0), wp.min(cx + guide.radius, guide.columns - 1) + 1):
+                block = by * guide.columns + bx
+                j = choice_in[block]
+                if j >= 0:
+                    facing = wp.dot(normal, points.normal[j])
+                    if facing > 0.0:
+                        offset = points.position[j] - position
+                        gap = wp.max(wp.abs(wp.dot(offset, normal_g)), wp.abs(wp.dot(offset, points.normal_g[j]))) / reach
+                        dx = (float(j % width) + 0.5 - px) / stride
+                        dy = (float(j / width) + 0.5 - py) / stride
+                        width2 = float(guide.radius) + 0.5
+                        near = wp.max(0.0, 1.0 - (dx * dx + dy * dy) / (width2 * width2))
+                        weight = near * near * wp.pow(facing, guide.sharpness) * wp.exp(-gap * gap)
+                        if weight > 1.0e-4:
+                            total += weight
+                            before += before_in[block] * weight
+                            after += after_in[block] * weight
+        if total > 1.0e-3:
+            before_out[i] = before / total
+            after_out[i] = after / total
+        else:
+            missing = 1
+    missing_out[i] = missing
+
+
+@wp.kernel
+def _scatter_missing(
+    first: int,
+    index_in: wp.array(dtype=wp.int32),
+    before_in: wp.array(dtype=wp.vec3),
+    after_in: wp.array(dtype=wp.vec3),
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+):
+    """Put what was gathered at listed points where they are; every point is listed once."""
+    i = first + wp.tid()
+    before_out[index_in[i]] = before_in[i]
+    after_out[index_in[i]] = after_in[i]
+
+
+@wp.func
+def diffuse_reflectance(s: Surface, wo: wp.vec3, alpha_max: float) -> wp.vec3:
+    """Radiance per irradiance of hemispherical light: the Lambert lobe under its interface, and a GGX lobe that is too
+    rough for the specular pass."""
+    one = wp.vec3(1.0, 1.0, 1.0)
+    enter = one - s.f0 - (wp.vec3(s.f90, s.f90, s.f90) - s.f0) * (1.0 / 21.0)
+    leave = one - fresnel(s.f0, s.f90, wp.dot(s.normal, wo))
+    result = wp.cw_mul(s.diffuse, wp.cw_mul(enter, leave)) * INV_PI
+    if s.f90 > 0.0 and s.alpha > alpha_max:
+        result += hemispherical_albedo_specular(s) * INV_PI
+    return result
+
+
+@wp.kernel
+def _shade_indirect(
+    first: int,
+    points: Points,
+    before_in: wp.array(dtype=wp.vec3),
+    after_in: wp.array(dtype=wp.vec3),
+    alpha_max: float,
+    with_before: int,
+    light_out: wp.array(dtype=wp.vec3),
+    radiance_before_out: wp.array(dtype=wp.vec3),
+):
+    """Add diffusely reflected indirect light: after on synthetic points (eq. 8), after - before on real ones (eq. 6)."""
+    i = first + wp.tid()
+    role = points.role[i]
+    if role != BACKGROUND:
+        s = load_surface(points, i)
+        reflectance = diffuse_reflectance(s, points.view[i], alpha_max)
+        if role == SYNTHETIC:
+            light_out[i] += wp.cw_mul(reflectance, after_in[i])
+        else:
+            light_out[i] += wp.cw_mul(reflectance, after_in[i] - before_in[i])
+            if with_before != 0:
+                radiance_before_out[i] += wp.cw_mul(reflectance, before_in[i])
+
+
+@wp.struct
+class Glossy:
+    """Settings of the specular pass."""
+
+    rays: wp.int32
+    light_samples: wp.int32  # of the direct pass, which shares the highlights
+    seed: wp.int32
+
+
+@wp.func
+def lights_along(
+    lights: Lights, s: Surface, wo: wp.vec3, origin: wp.vec3, direction: wp.vec3, reach: float, glossy: Glossy, with_added: int
+) -> wp.vec3:
+    """Finite lights that a reflected ray meets, with the power-heuristic share that the direct pass left."""
+    total = wp.vec3(0.0, 0.0, 0.0)
+    b = float(glossy.rays) * vndf_pdf(s, wo, direction)
+    for k in range(lights.count):
+        if lights.kind[k] != DOME and (lights.role[k] != ADDED or with_added != 0):
+            met = light_along_ray(lights, k, origin, direction)
+            if met.pdf > 0.0 and met.distance < reach:
+                a = float(glossy.light_samples) * met.pdf
+                total += met.radiance * (b * b / (a * a + b * b))
+    return total
+
+
+@wp.kernel
+def _shade_specular_rays(
+    first: int,
+    points: Points,
+    index_in: wp.array(dtype=wp.int32),
+    geo: Geometry,
+    world: World,
+    lights: Lights,
+    glossy: Glossy,
+    with_before: int,
+    light_out: wp.array(dtype=wp.vec3),
+    before_out: wp.array(dtype=wp.vec3),
+):
+    """Add the GGX lobe's reflections by exact rays with visible-normal sampling (eq. 6's second term)."""
+    i = first + wp.tid()
+    j = index_in[i]
+    s = load_surface(points, j)
+    wo = points.view[j]
+    t = tangent_of(s.normal)
+    b = wp.cross(s.normal, t)
+    local = wp.vec3(wp.dot(wo, t), wp.dot(wo, b), wp.dot(wo, s.normal))
+    before = wp.vec3(0.0, 0.0, 0.0)
+    after = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(glossy.rays):
+        h = ggx_sample_half(local, s.alpha, sobol2(glossy.seed, j, k, 17))
+        half = t * h[0] + b * h[1] + s.normal * h[2]
+        direction = wp.normalize(half * (2.0 * wp.dot(wo, half)) - wo)
+        pdf = vndf_pdf(s, wo, direction)
+        if wp.dot(direction, s.normal_g) > 0.0 and pdf > 0.0:
+            weight = brdf_cos_specular(s, wo, direction) / pdf
+            origin = spawn_point(s, direction)
+            light = ray_incident(world, geo, origin, direction, 1.0 / (pdf * float(glossy.rays)))
+            lamps = lights_along(lights, s, wo, origin, direction, light.distance_after, glossy, 1)
+            after += wp.cw_mul(weight, light.after * INV_PI + lamps)
+            if s.synthetic == 0:
+                lamps = lights_along(lights, s, wo, origin, direction, light.distance_before, glossy, 0)
+                before += wp.cw_mul(weight, light.before * INV_PI + lamps)
+    after = after / float(glossy.rays)
+    before = before / float(glossy.rays)
+    light_out[j] += after - before
+    if with_before != 0:
+        before_out[j] += before
+
+
+@wp.kernel
+def _shade_specular_cones(
+    first: int,
+    points: Points,
+    index_in: wp.array(dtype=wp.int32),
+    world: World,
+    cone: ConeSettings,
+    with_before: int,
+    light_out: wp.array(dtype=wp.vec3),
+    before_out: wp.array(dtype=wp.vec3),
+):
+    """Add the GGX lobe's reflections by one cone around the mirror direction, as wide as the lobe (eq. 6).
+
+    The cone's half angle holds half of the lobe: tan = alpha for normals (GGX's median slope is alpha), doubled by the
+    reflection.
+    """
+    i = first + wp.tid()
+    j = index_in[i]
+    s = load_surface(points, j)
+    wo = points.view[j]
+    direction = wp.normalize(s.normal * (2.0 * wp.dot(s.normal, wo)) - wo)
+    if wp.dot(direction, s.normal_g) > 0.0:
+        shaft = cone
+        shaft.aperture = wp.min(4.0 * wp.atan(s.alpha), 3.0)
+        origin = s.position + s.normal_g * (cone.start * world.fine.voxel)
+        light = cone_incident(world, origin, direction, shaft, 1 - s.synthetic)
+        weight = fresnel(s.f0, s.f90, wp.dot(s.normal, wo)) * INV_PI
+        if s.synthetic != 0:
+            light_out[j] += wp.cw_mul(weight, light.after)
+        else:
+            light_out[j] += wp.cw_mul(weight, light.after - light.before)
+            if with_before != 0:
+                before_out[j] += wp.cw_mul(weight, light.before)
+
+
+@wp.kernel
+def _point_pixels(
+    first: int, edge_pixel_in: wp.array(dtype=wp.int32), pixels: int, samples: int, pixel_out: wp.array(dtype=wp.int32)
+):
+    """The pixel that each shading point belongs to."""
+    i = first + wp.tid()
+    pixel = i
+    if i >= pixels:
+        pixel = edge_pixel_in[(i - pixels) / samples]
+    pixel_out[i] = pixel
+
+
+@wp.kernel
+def _mark_role(first: int, points: Points, role: int, mark_out: wp.array(dtype=wp.int32)):
+    i = first + wp.tid()
+    mark_out[i] = wp.where(points.role[i] == role, 1, 0)
+
+
+@wp.kernel
+def _merge(
+    first: int,
+    before_in: wp.array(dtype=wp.vec3),
+    after_in: wp.array(dtype=wp.vec3),
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+):
+    """Join two sets of irradiance, each zero at the points of the other."""
+    i = first + wp.tid()
+    before_out[i] += before_in[i]
+    after_out[i] += after_in[i]
+
+@wp.kernel
+def _mark_glossy(first: int, points: Points, alpha_max: float, flag_out: wp.array(dtype=wp.int32)):
+    """1 where a point has a specular lobe that the specular pass treats."""
+    i = first + wp.tid()
+    glossy = points.role[i] != BACKGROUND and points.lobe[i][0] > 0.0 and points.lobe[i][1] <= alpha_max
+    flag_out[i] = wp.where(glossy, 1, 0)

@@ -1,0 +1,199 @@
+"""Shading points: one at every pixel's centre, and more where the picture has an edge."""
+
+import warp as wp
+
+from warp_dvct.kernels.geometry import FAR, CameraFrame, Geometry, Hit, camera_ray, trace_all, trace_real
+from warp_dvct.kernels.materials import Materials, Surface, surface_at
+from warp_dvct.kernels.sampling import sobol2
+
+wp.set_module_options({"enable_backward": False})
+
+BACKGROUND = wp.constant(-1)
+REAL = wp.constant(0)
+SYNTHETIC = wp.constant(1)
+
+# An edge: a neighbour farther off the tangent plane than this many pixel footprints, or turned by more than 18 degrees.
+PLANE_GAP = wp.constant(1.5)
+NORMAL_GAP = wp.constant(0.95)
+
+
+@wp.struct
+class Points:
+    """Surfaces to be shaded, structure of arrays; ``role`` is BACKGROUND where there is none."""
+
+    role: wp.array(dtype=wp.int32)
+    triangle: wp.array(dtype=wp.int32)
+    position: wp.array(dtype=wp.vec3)
+    normal_g: wp.array(dtype=wp.vec3)
+    normal: wp.array(dtype=wp.vec3)
+    view: wp.array(dtype=wp.vec3)  # unit vector to the camera
+    base_color: wp.array(dtype=wp.vec3)
+    diffuse: wp.array(dtype=wp.vec3)
+    f0: wp.array(dtype=wp.vec3)
+    lobe: wp.array(dtype=wp.vec2)  # f90 and GGX alpha
+    reach: wp.array(dtype=wp.float32)
+    footprint: wp.array(dtype=wp.float32)  # size of a pixel at the surface, in volume space
+
+
+@wp.func
+def load_surface(points: Points, i: int) -> Surface:
+    s = Surface()
+    s.position = points.position[i]
+    s.normal_g = points.normal_g[i]
+    s.normal = points.normal[i]
+    s.base_color = points.base_color[i]
+    s.diffuse = points.diffuse[i]
+    s.f0 = points.f0[i]
+    s.f90 = points.lobe[i][0]
+    s.alpha = points.lobe[i][1]
+    s.reach = points.reach[i]
+    s.synthetic = wp.where(points.role[i] == SYNTHETIC, 1, 0)
+    s.triangle = points.triangle[i]
+    s.front = 1
+    return s
+
+
+@wp.func
+def store_hit(
+    geo: Geometry, mats: Materials, hit: Hit, origin: wp.vec3, direction: wp.vec3, spread: float, i: int, points: Points
+):
+    """``spread`` is the size of a pixel at distance 1."""
+    points.role[i] = BACKGROUND
+    points.triangle[i] = -1
+    points.view[i] = -direction
+    if hit.found != 0:
+        s = surface_at(geo, mats, hit, origin, direction)
+        points.role[i] = wp.where(hit.synthetic != 0, SYNTHETIC, REAL)
+        points.triangle[i] = hit.triangle
+        points.position[i] = s.position
+        points.normal_g[i] = s.normal_g
+        points.normal[i] = s.normal
+        points.base_color[i] = s.base_color
+        points.diffuse[i] = s.diffuse
+        points.f0[i] = s.f0
+        points.lobe[i] = wp.vec2(s.f90, s.alpha)
+        points.reach[i] = s.reach
+        points.footprint[i] = hit.t * spread
+
+
+@wp.func
+def see(
+    geo: Geometry, mats: Materials, cam: CameraFrame, px: float, py: float, width: int, height: int, i: int, points: Points
+):
+    ray = camera_ray(cam, px, py, width, height)
+    hit = trace_all(geo, ray.origin, ray.direction, ray.t_max)
+    spread = (cam.tan_right - cam.tan_left) / float(width)
+    store_hit(geo, mats, hit, ray.origin, ray.direction, spread, i, points)
+
+
+@wp.kernel
+def _see_centers(
+    first: int,
+    geo: Geometry,
+    mats: Materials,
+    cam: CameraFrame,
+    width: int,
+    height: int,
+    points_out: Points,
+):
+    i = first + wp.tid()
+    see(geo, mats, cam, float(i % width) + 0.5, float(i / width) + 0.5, width, height, i, points_out)
+
+
+@wp.func
+def differs(points: Points, i: int, j: int) -> bool:
+    role = points.role[i]
+    if role != points.role[j]:
+        return True
+    if role == BACKGROUND or points.triangle[i] == points.triangle[j]:
+        return False
+    if wp.dot(points.normal[i], points.normal[j]) < NORMAL_GAP:
+        return True
+    offset = points.position[j] - points.position[i]
+    reach = PLANE_GAP * wp.max(points.footprint[i], points.footprint[j])
+    gap = wp.max(wp.abs(wp.dot(offset, points.normal_g[i])), wp.abs(wp.dot(offset, points.normal_g[j])))
+    if gap > reach:
+        return True
+    change = wp.length(points.base_color[i] - points.base_color[j])
+    return change > 0.1
+
+
+@wp.kernel
+def _mark_edges(first: int, points: Points, width: int, height: int, mark_out: wp.array(dtype=wp.int32)):
+    """1 where any of the eight neighbours shows another surface."""
+    i = first + wp.tid()
+    x = i % width
+    y = i / width
+    mark = int(0)
+    for dy in range(-1, 2):
+        for dx in range(-1, 2):
+            if mark == 0 and x + dx >= 0 and x + dx < width and y + dy >= 0 and y + dy < height:
+                if differs(points, i, (y + dy) * width + x + dx):
+                    mark = 1
+    mark_out[i] = mark
+
+
+@wp.kernel
+def _list_edges(
+    first: int,
+    mark_in: wp.array(dtype=wp.int32),
+    end_in: wp.array(dtype=wp.int32),
+    rank_out: wp.array(dtype=wp.int32),
+    pixel_out: wp.array(dtype=wp.int32),
+):
+    """Rank of each marked element (-1 elsewhere), and the marked elements in order."""
+    i = first + wp.tid()
+    rank_out[i] = -1
+    if mark_in[i] != 0:
+        rank_out[i] = end_in[i] - 1
+        pixel_out[end_in[i] - 1] = i
+
+
+@wp.kernel
+def _see_edges(
+    first: int,
+    geo: Geometry,
+    mats: Materials,
+    cam: CameraFrame,
+    pixel_in: wp.array(dtype=wp.int32),
+    width: int,
+    height: int,
+    samples: int,
+    seed: int,
+    points_out: Points,
+):
+    """Sub-pixel points of the edge pixels, spread over the pixel's area; they follow the centres in ``points_out``."""
+    i = first + wp.tid()
+    pixel = pixel_in[i / samples]
+    xi = sobol2(seed, pixel, i % samples, 0)
+    px = float(pixel % width) + xi[0]
+    py = float(pixel / width) + xi[1]
+    see(geo, mats, cam, px, py, width, height, width * height + i, points_out)
+
+
+@wp.kernel
+def _mark_synthetic(first: int, points: Points, mark_out: wp.array(dtype=wp.int32)):
+    i = first + wp.tid()
+    mark_out[i] = wp.where(points.role[i] == SYNTHETIC, 1, 0)
+
+
+@wp.kernel
+def _see_behind(
+    first: int,
+    geo: Geometry,
+    mats: Materials,
+    cam: CameraFrame,
+    visible: Points,
+    index_in: wp.array(dtype=wp.int32),
+    width: int,
+    points_out: Points,
+):
+    """Real surfaces behind synthetic points: the real scene alone where the two G-buffers differ."""
+    i = first + wp.tid()
+    j = index_in[i]
+    direction = -visible.view[j]
+    spread = (cam.tan_right - cam.tan_left) / float(width)
+    start = visible.position[j]
+    hit = trace_real(geo, start, direction, FAR)
+    hit.t += wp.dot(start - cam.origin, direction)
+    store_hit(geo, mats, hit, cam.origin, direction, spread, i, points_out)

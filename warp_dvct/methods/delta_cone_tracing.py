@@ -1,0 +1,341 @@
+"""Delta voxel cone tracing (Franke 2014): relight a real scene by the light that synthetic objects change.
+
+What it costs: one ray per pixel, RSM rays about as many as occupied voxels, and a sparse gather; independent of the
+triangle count once voxelised. Where it is wrong: light that a glossy surface focuses onto others is spread as if the
+surface were diffuse; detail of the indirect light below a voxel or below the gather's spacing is blurred; glossy
+reflections show the voxels' radiosity; what lies beyond the coarse volume reflects nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_dvct.device_scene import DeviceScene
+from warp_dvct.kernels import cones, gather, shading
+from warp_dvct.kernels.volume import Volume
+from warp_dvct.launch import Launcher
+from warp_dvct.layers import Radiance
+from warp_dvct.passes.bounces import choose_patches, mean_albedo, reinject, solve_bounces
+from warp_dvct.passes.environment import build_environment
+from warp_dvct.passes.gather import (
+    Gatherer,
+    find_glossy,
+    gather_all,
+    gather_sparse,
+    merge,
+    point_pixels,
+    shade_indirect,
+    shade_specular,
+)
+from warp_dvct.passes.gbuffer import GBuffer, render_gbuffer
+from warp_dvct.passes.injection import empty_flux, inject
+from warp_dvct.passes.pyramid import build_pyramid, light_faces
+from warp_dvct.passes.resolve import resolve
+from warp_dvct.passes.rsm import render_rsm
+from warp_dvct.passes.shading import shade_direct
+from warp_dvct.passes.voxels import Box, Voxels, voxelize
+from warp_dvct.plan import Plan
+from warp_dvct.scene import LightKind, Role, Scene
+
+
+@dataclass(frozen=True)
+class LightField:
+    """The lit volumes, which depend on geometry and lights but not on the camera.
+
+    Attributes:
+        world: ``kernels.gather.World``, as gathering kernels take it.
+        volumes: The voxels behind it, fine first; empty where the plan needs none.
+    """
+
+    world: Any
+    volumes: tuple[Voxels, ...]
+
+
+def light_volumes(launcher: Launcher, scene: Scene, device_scene: DeviceScene, plan: Plan) -> LightField:
+    """Voxelise, inject every light's RSM pair, re-inject further bounces, filter (Franke 2014, section 3.2)."""
+    settings = plan.settings
+    needed = {p.name: p.needed for p in plan.passes}
+    normals = launcher.array(_normals(device_scene.triangles_vs), wp.vec3)
+    volumes: list[Voxels] = []
+    if needed["voxelize"]:
+        with launcher.scope("voxelize"):
+            volumes = [_voxelize(launcher, device_scene, normals, b) for b in (plan.fine, plan.coarse) if b]
+    world = _world(launcher, scene, normals, volumes)
+    if not volumes or settings.bounces == 0:
+        return LightField(world, tuple(volumes))
+    fluxes = [empty_flux(launcher, v) for v in volumes]
+    for voxels, flux in zip(volumes, fluxes, strict=True):
+        _inject_lights(launcher, device_scene, plan, voxels, flux)
+        with launcher.scope("light faces"):
+            light_faces(launcher, voxels, flux, filter=settings.cones_filter)
+    if settings.bounces > 1:
+        with launcher.scope("bounces"):
+            _bounce(launcher, device_scene, normals, world, volumes, fluxes, plan)
+    if needed["pyramid"]:
+        with launcher.scope("pyramid"):
+            for voxels in volumes:
+                build_pyramid(launcher, voxels, filter=settings.cones_filter)
+    return LightField(world, tuple(volumes))
+
+
+def render(
+    launcher: Launcher, scene: Scene, device_scene: DeviceScene, light_field: LightField, plan: Plan, *, with_before: bool
+) -> Radiance:
+    """Shade what the camera sees (Franke 2014, section 3.3): direct, indirect diffuse, indirect specular, resolve.
+
+    Args:
+        with_before: Also render the real scene alone, to serve as the plate.
+    """
+    settings, world = plan.settings, light_field.world
+    with launcher.scope("gbuffer"):
+        buffer = render_gbuffer(
+            launcher,
+            device_scene,
+            plan.width,
+            plan.height,
+            edge_samples=settings.antialias,
+            behind=with_before,
+            seed=settings.seed,
+        )
+    light = launcher.zeros(buffer.count, wp.vec3)
+    before = launcher.zeros(buffer.count if with_before else 1, wp.vec3)
+    hidden_before = launcher.zeros(max(1, buffer.behind_count), wp.vec3)
+    if plan.changes or with_before:
+        parts = [_Part(buffer.points, buffer.count, light, before, with_before)]
+        if with_before:
+            spare = launcher.zeros(max(1, buffer.behind_count), wp.vec3)
+            parts.append(_Part(buffer.behind, buffer.behind_count, spare, hidden_before, True))
+        for part in parts:
+            with launcher.scope("direct"):
+                _shade_direct(launcher, scene, device_scene, plan, world, part)
+            if _has_indirect(scene, plan):
+                with launcher.scope("gather"):
+                    irradiance = _irradiance(launcher, device_scene, plan, world, buffer, part)
+                    shade_indirect(
+                        launcher,
+                        part.points,
+                        part.count,
+                        irradiance,
+                        alpha_max=plan.alpha_max,
+                        light=part.light,
+                        before=part.before,
+                        with_before=part.with_before,
+                    )
+            if plan.glossy:
+                with launcher.scope("specular"):
+                    _shade_specular(launcher, device_scene, plan, world, part)
+    with launcher.scope("resolve"):
+        return resolve(
+            launcher,
+            device_scene,
+            buffer,
+            world.env,
+            light=light,
+            before=before,
+            behind_before=hidden_before,
+            with_before=with_before,
+        )
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Points to shade and where their light goes: what is seen, or the real surfaces behind synthetic ones."""
+
+    points: Any
+    count: int
+    light: Any
+    before: Any
+    with_before: bool
+
+
+def _normals(triangles: np.ndarray) -> np.ndarray:
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]).astype(np.float64)
+    length = np.linalg.norm(cross, axis=-1, keepdims=True)
+    return np.where(length > 0, cross / np.where(length > 0, length, 1.0), [0.0, 0.0, 1.0]).astype(np.float32)
+
+
+def _voxelize(launcher: Launcher, scene: DeviceScene, normals: Any, box: Box) -> Voxels:
+    corners = launcher.array(scene.triangles_vs.reshape(-1, 3), wp.vec3)
+    return voxelize(launcher, corners, normals, scene.geometry.double_sided, scene.synthetic_first, box)
+
+
+def _world(launcher: Launcher, scene: Scene, normals: Any, volumes: list[Voxels]) -> Any:
+    world = gather.World()
+    world.fine = volumes[0].volume if volumes else _no_volume(launcher)
+    world.has_coarse = int(len(volumes) > 1)
+    world.coarse = volumes[1].volume if len(volumes) > 1 else world.fine
+    world.env = build_environment(launcher, scene.lights)
+    world.normals = normals
+    return world
+
+
+def _no_volume(launcher: Launcher) -> Any:
+    """A volume of one empty voxel, for kernels that take one and will find nothing in it."""
+    volume = Volume()
+    volume.low, volume.voxel, volume.n, volume.levels = wp.vec3(0.0, 0.0, 0.0), 1.0, 1, 1
+    volume.table_start = launcher.zeros(1, wp.int32)
+    volume.tables = launcher.full(1, -1, wp.int32)
+    volume.cells = launcher.full(1, -1, wp.int32)
+    volume.field = launcher.zeros(1, wp.vec4)
+    return volume
+
+
+def _inject_lights(launcher: Launcher, scene: DeviceScene, plan: Plan, voxels: Voxels, flux: Any) -> None:
+    box = voxels.box
+    middle = [box.low[k] + 0.5 * box.edge for k in range(3)]
+    fine = box is plan.fine
+    for entry in plan.maps:
+        with launcher.scope("rsm"):
+            maps = render_rsm(
+                launcher,
+                scene,
+                entry.light,
+                entry.size if fine else entry.coarse_size,
+                center=(middle[0], middle[1], middle[2]),
+                radius=box.edge * math.sqrt(3.0) / 2.0,
+                start=plan.start + box.edge,
+                seed=plan.settings.seed,
+            )
+        with launcher.scope("inject"):
+            inject(launcher, voxels, maps, flux)
+
+
+def _bounce(
+    launcher: Launcher,
+    scene: DeviceScene,
+    normals: Any,
+    world: Any,
+    volumes: list[Voxels],
+    fluxes: list[Any],
+    plan: Plan,
+) -> None:
+    settings = plan.settings
+    patches = choose_patches(launcher, scene, volumes[-1], normals, settings.patches_count)
+    total = solve_bounces(
+        launcher,
+        scene,
+        world,
+        patches,
+        bounces=settings.bounces - 1,
+        rays=settings.patches_rays,
+        seed=settings.seed,
+    )
+    for voxels, flux in zip(volumes, fluxes, strict=True):
+        albedo = mean_albedo(launcher, scene, voxels, normals)
+        reinject(launcher, voxels, albedo, flux, patches, total)
+        light_faces(launcher, voxels, flux, filter=settings.cones_filter)
+
+
+def _has_indirect(scene: Scene, plan: Plan) -> bool:
+    return plan.settings.bounces > 0 or any(light.kind == LightKind.DOME for light in scene.lights)
+
+
+def _cone(plan: Plan, with_before: bool, aperture: float = 0.0) -> Any:
+    settings = plan.settings
+    cone = cones.ConeSettings()
+    cone.aperture = aperture
+    cone.step = settings.cones_step
+    cone.start = settings.cones_start
+    cone.reach = 4.0 * (plan.coarse.edge if plan.coarse else plan.fine.edge)
+    cone.additive = int(settings.cones_coverage == "additive")
+    cone.split = 0 if settings.cones_delta == "dual" else (2 if with_before else 1)
+    return cone
+
+
+def _shade_direct(
+    launcher: Launcher, scene: Scene, device_scene: DeviceScene, plan: Plan, world: Any, part: _Part
+) -> None:
+    settings = plan.settings
+    direct = shading.Direct()
+    direct.samples = settings.shadows_samples
+    direct.glossy = settings.glossy_rays if plan.glossy and settings.glossy == "rays" else 0
+    direct.alpha_max = plan.alpha_max
+    direct.with_before = int(part.with_before)
+    direct.seed = settings.seed
+    bounds = scene.bounds(Role.SYNTHETIC)
+    if bounds is None:
+        direct.center, direct.radius = wp.vec3(0.0, 0.0, 0.0), 0.0
+    else:
+        low, high = ((b - device_scene.origin) * device_scene.scale for b in bounds)
+        direct.center = wp.vec3(*(0.5 * (low + high)))
+        direct.radius = 0.5 * float(np.linalg.norm(high - low)) * 1.001
+    cone = None
+    if settings.shadows == "cone":
+        cone = _cone(plan, part.with_before)
+        cone.split = 0  # a shadow needs both occupancies
+    shade_direct(
+        launcher,
+        device_scene,
+        part.points,
+        part.count,
+        direct,
+        light=part.light,
+        before=part.before,
+        world=world,
+        cone=cone,
+    )
+
+
+def _irradiance(
+    launcher: Launcher, scene: DeviceScene, plan: Plan, world: Any, buffer: GBuffer, part: _Part
+) -> tuple[Any, Any]:
+    """Irradiance before and after at the part's points: sparse for what is seen, everywhere for what is hidden."""
+    settings = plan.settings
+    cone = None
+    if settings.gather == "cones":
+        cone = _cone(plan, part.with_before, math.radians(settings.cones_aperture))
+    real = Gatherer(scene, world, settings.gather_rays, settings.seed, settings.cones_count, cone)
+    if part.points is not buffer.points:
+        fewer = Gatherer(scene, world, max(1, settings.gather_rays // 4), settings.seed, settings.cones_count, cone)
+        return gather_all(launcher, part.points, part.count, fewer)
+    pixel = point_pixels(launcher, buffer)
+    synthetic = Gatherer(scene, world, settings.gather_object_rays, settings.seed, settings.cones_count, cone)
+    before, after = gather_sparse(
+        launcher,
+        buffer,
+        pixel,
+        Role.REAL,
+        real,
+        stride=settings.gather_stride,
+        radius=settings.gather_radius,
+    )
+    if scene.synthetic is not None:
+        object_before, object_after = gather_sparse(
+            launcher,
+            buffer,
+            pixel,
+            Role.SYNTHETIC,
+            synthetic,
+            stride=settings.gather_object_stride,
+            radius=settings.gather_radius,
+        )
+        merge(launcher, (before, after), (object_before, object_after))
+    return before, after
+
+
+def _shade_specular(launcher: Launcher, scene: DeviceScene, plan: Plan, world: Any, part: _Part) -> None:
+    settings = plan.settings
+    index, count = find_glossy(launcher, part.points, part.count, plan.alpha_max)
+    glossy = gather.Glossy()
+    glossy.rays = settings.glossy_rays
+    glossy.light_samples = settings.shadows_samples
+    glossy.seed = settings.seed
+    cone = _cone(plan, part.with_before) if settings.glossy == "cones" else None
+    shade_specular(
+        launcher,
+        scene,
+        part.points,
+        index,
+        count,
+        world,
+        glossy=glossy,
+        cone=cone,
+        light=part.light,
+        before=part.before,
+        with_before=part.with_before,
+    )

@@ -1,0 +1,163 @@
+"""Second and further bounces: a radiosity solution on patches, re-injected into the volumes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from warp_dvct.device_scene import DeviceScene
+from warp_dvct.kernels import bounces as kernels
+from warp_dvct.kernels.voxelization import EMPTY_KEY
+from warp_dvct.launch import Launcher
+from warp_dvct.passes.voxels import Voxels, count_below, sort_by_key, unique_runs
+
+
+@dataclass(frozen=True)
+class Patches:
+    """One surface patch behind each occupied face of the voxels of a level.
+
+    Attributes:
+        voxels: The volume they were taken from. level, level_first: Its level, and that level's first record.
+        data: ``kernels.Patches``. count: How many.
+        table: int ``[records of the level * 6]``, patch of a face or -1.
+    """
+
+    voxels: Voxels
+    level: int
+    level_first: int
+    data: Any
+    count: int
+    table: Any
+
+
+def mean_albedo(launcher: Launcher, scene: DeviceScene, voxels: Voxels, normals: Any) -> Any:
+    """Area-weighted hemispherical albedo per level-0 record, before and after: vec3 ``[records * 2]``."""
+    pieces = voxels.fragments
+    records = voxels.level_records[0]
+    albedo = launcher.zeros(max(1, records * 2), wp.vec3)
+    launcher.launch(
+        kernels._mean_albedo,
+        records,
+        [
+            scene.geometry,
+            scene.materials,
+            normals,
+            pieces.record_start,
+            pieces.order,
+            pieces.triangle,
+            pieces.place,
+            pieces.count,
+            records,
+        ],
+        [albedo],
+    )
+    return albedo
+
+
+def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, normals: Any, most: int) -> Patches:
+    """Patches of the finest level that has no more than about ``most`` of them."""
+    level = 0
+    while level + 1 < len(voxels.level_records) and 2 * voxels.level_records[level] > most:
+        level += 1
+    level_first = sum(voxels.level_records[:level])
+    records = voxels.level_records[0]
+    key = launcher.empty(max(1, 12 * records), wp.int32)
+    order = launcher.empty(max(1, 12 * records), wp.int32)
+    launcher.launch(
+        kernels._face_keys,
+        6 * records,
+        [voxels.level_keys[0], voxels.area, voxels.volume, level, level_first, int(EMPTY_KEY)],
+        [key],
+    )
+    sort_by_key(launcher, key, order, 6 * records)
+    keys, starts = unique_runs(launcher, key, 6 * records)
+    count = keys.shape[0]
+    data = kernels.Patches()
+    data.position, data.normal, data.albedo = (launcher.zeros(max(1, count), wp.vec3) for _ in range(3))
+    data.reach = launcher.zeros(max(1, count), wp.float32)
+    data.real = launcher.zeros(max(1, count), wp.int32)
+    table = launcher.full(max(1, 6 * voxels.level_records[level]), -1, wp.int32)
+    pieces = voxels.fragments
+    launcher.launch(
+        kernels._choose_patches,
+        count,
+        [
+            scene.geometry,
+            scene.materials,
+            normals,
+            keys,
+            starts,
+            order,
+            count_below(launcher, key, 6 * records),
+            count,
+            voxels.area,
+            pieces.record_start,
+            pieces.order,
+            pieces.triangle,
+            pieces.place,
+            pieces.count,
+            records,
+        ],
+        [data, table],
+    )
+    return Patches(voxels, level, level_first, data, count, table)
+
+
+def solve_bounces(
+    launcher: Launcher, scene: DeviceScene, world: Any, patches: Patches, *, bounces: int, rays: int, seed: int = 0
+) -> Any:
+    """Irradiance of patches from bounces 1 … ``bounces``, before and after: vec3 ``[patches * 2]``.
+
+    Args:
+        world: ``kernels.gather.World`` whose volumes hold directly lit radiosity.
+        rays: Cosine-distributed rays per patch; they are traced once.
+    """
+    count = patches.count
+    links = launcher.empty(max(1, count * rays), wp.vec2i)
+    last = launcher.zeros(max(1, 2 * count), wp.vec3)
+    launcher.launch(
+        kernels._link_patches,
+        count,
+        [
+            scene.geometry,
+            world,
+            patches.data,
+            patches.voxels.volume,
+            patches.level,
+            patches.level_first,
+            patches.table,
+            rays,
+            seed,
+        ],
+        [links, last],
+    )
+    total = launcher.empty(max(1, 2 * count), wp.vec3)
+    wp.copy(total, last)
+    following = launcher.zeros(max(1, 2 * count), wp.vec3)
+    for _ in range(bounces - 1):
+        launcher.launch(kernels._bounce, count, [patches.data, links, rays, last], [following, total])
+        last, following = following, last
+    return total
+
+
+def reinject(launcher: Launcher, voxels: Voxels, albedo: Any, flux: Any, patches: Patches, total: Any) -> None:
+    """Add what the patches' irradiance makes a volume's surfaces reflect to ``flux``, in place."""
+    launcher.launch(
+        kernels._reinject,
+        voxels.level_records[0],
+        [
+            voxels.level_keys[0],
+            voxels.volume,
+            voxels.area,
+            albedo,
+            patches.voxels.volume,
+            patches.level,
+            patches.level_first,
+            patches.table,
+            patches.data,
+            total,
+        ],
+        [flux],
+    )

@@ -1,0 +1,168 @@
+"""Indirect light at shading points: sparse gathering, reconstruction, and specular reflections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from warp_dvct.device_scene import DeviceScene
+from warp_dvct.kernels import gather as kernels
+from warp_dvct.launch import Launcher
+from warp_dvct.passes.gbuffer import GBuffer, compact
+from warp_dvct.scene import Role
+
+PLANE_TOLERANCE = 0.5  # distance off the tangent plane, in gather strides, at which a gathered point counts 1/e
+NORMAL_SHARPNESS = 8.0  # exponent of the normals' cosine
+
+
+@dataclass(frozen=True)
+class Gatherer:
+    """How irradiance is gathered at a list of points: exact rays, or cones where ``cone`` is given."""
+
+    scene: DeviceScene
+    world: Any
+    rays: int
+    seed: int
+    cones: int = 0
+    cone: Any = None
+
+    def run(self, launcher: Launcher, points: Any, index: Any, count: int) -> tuple[Any, Any]:
+        """Irradiance [W m^-2] before and after at points ``index`` (-1 gives 0): two vec3 ``[count]``."""
+        before = launcher.empty(max(1, count), wp.vec3)
+        after = launcher.empty(max(1, count), wp.vec3)
+        if self.cone is None:
+            launcher.launch(
+                kernels._gather_rays,
+                count,
+                [points, index, self.scene.geometry, self.world, self.rays, self.seed],
+                [before, after],
+            )
+        else:
+            launcher.launch(
+                kernels._gather_cones,
+                count,
+                [points, index, self.world, self.cones, self.cone, self.seed],
+                [before, after],
+            )
+        return before, after
+
+
+def point_pixels(launcher: Launcher, buffer: GBuffer) -> Any:
+    """The pixel of each shading point, int ``[count]``."""
+    pixel = launcher.empty(buffer.count, wp.int32)
+    launcher.launch(
+        kernels._point_pixels,
+        buffer.count,
+        [buffer.edge_pixel, buffer.width * buffer.height, max(1, buffer.edge_samples)],
+        [pixel],
+    )
+    return pixel
+
+
+def gather_sparse(
+    launcher: Launcher, buffer: GBuffer, pixel: Any, role: Role, gatherer: Gatherer, *, stride: int, radius: int
+) -> tuple[Any, Any]:
+    """Irradiance, before and after, at every shading point of a role.
+
+    One pixel of each ``stride`` x ``stride`` block is gathered; the others are reconstructed from the blocks within
+    ``radius`` that lie on the same surface. Points without any such block are gathered themselves.
+
+    Returns:
+        Two vec3 ``[buffer.count]``; 0 at points of the other role.
+    """
+    columns, rows = -(-buffer.width // stride), -(-buffer.height // stride)
+    choice = launcher.empty(columns * rows, wp.int32)
+    launcher.launch(
+        kernels._choose_points,
+        columns * rows,
+        [buffer.points, buffer.width, buffer.height, stride, columns, int(role), gatherer.seed],
+        [choice],
+    )
+    sparse_before, sparse_after = gatherer.run(launcher, buffer.points, choice, columns * rows)
+    guide = kernels.Guide()
+    guide.stride, guide.columns, guide.rows = stride, columns, rows
+    guide.radius = radius if stride > 1 else min(radius, 1)
+    guide.plane, guide.sharpness = PLANE_TOLERANCE, NORMAL_SHARPNESS
+    before = launcher.zeros(buffer.count, wp.vec3)
+    after = launcher.zeros(buffer.count, wp.vec3)
+    missing = launcher.empty(buffer.count, wp.int32)
+    launcher.launch(
+        kernels._reconstruct,
+        buffer.count,
+        [buffer.points, pixel, buffer.width, int(role), guide, choice, sparse_before, sparse_after],
+        [before, after, missing],
+    )
+    _, index, left = compact(launcher, missing)
+    left_before, left_after = gatherer.run(launcher, buffer.points, index, left)
+    launcher.launch(kernels._scatter_missing, left, [index, left_before, left_after], [before, after])
+    return before, after
+
+
+def gather_all(launcher: Launcher, points: Any, count: int, gatherer: Gatherer) -> tuple[Any, Any]:
+    """Irradiance, before and after, gathered at each of ``count`` points."""
+    everyone = launcher.full(max(1, count), 1, wp.int32)
+    _, index, _ = compact(launcher, everyone)
+    return gatherer.run(launcher, points, index, count)
+
+
+def shade_indirect(
+    launcher: Launcher,
+    points: Any,
+    count: int,
+    irradiance: tuple[Any, Any],
+    *,
+    alpha_max: float,
+    light: Any,
+    before: Any,
+    with_before: bool,
+) -> None:
+    """Add diffusely reflected irradiance to ``light`` (and ``before``): Franke 2014, eqs. 6 and 8, first terms."""
+    launcher.launch(
+        kernels._shade_indirect, count, [points, *irradiance, alpha_max, int(with_before)], [light, before]
+    )
+
+
+def shade_specular(
+    launcher: Launcher,
+    scene: DeviceScene,
+    points: Any,
+    index: Any,
+    count: int,
+    world: Any,
+    *,
+    glossy: Any,
+    cone: Any,
+    light: Any,
+    before: Any,
+    with_before: bool,
+) -> None:
+    """Add specular reflections at the ``count`` points listed in ``index``: eqs. 6 and 8, second terms.
+
+    By exact visible-normal rays, or by one cone as wide as the lobe where ``cone`` is given.
+    """
+    if cone is None:
+        launcher.launch(
+            kernels._shade_specular_rays,
+            count,
+            [points, index, scene.geometry, world, scene.lights, glossy, int(with_before)],
+            [light, before],
+        )
+    else:
+        launcher.launch(
+            kernels._shade_specular_cones, count, [points, index, world, cone, int(with_before)], [light, before]
+        )
+
+
+def merge(launcher: Launcher, into: tuple[Any, Any], other: tuple[Any, Any]) -> None:
+    """Add irradiance gathered for one role to that of the other; each is 0 at the points of the other."""
+    launcher.launch(kernels._merge, into[0].shape[0], [*other], [*into])
+
+
+def find_glossy(launcher: Launcher, points: Any, count: int, alpha_max: float) -> tuple[Any, int]:
+    """Indices of the points whose specular lobe has a GGX alpha up to ``alpha_max``, and their number."""
+    mark = launcher.zeros(max(1, count), wp.int32)
+    launcher.launch(kernels._mark_glossy, count, [points, alpha_max], [mark])
+    _, index, found = compact(launcher, mark)
+    return index, found

@@ -1,0 +1,108 @@
+"""G-buffer: shading points of the whole scene, and of the real scene alone where the two differ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from warp_dvct.device_scene import DeviceScene
+from warp_dvct.kernels import gbuffer as kernels
+from warp_dvct.kernels.gbuffer import Points
+from warp_dvct.launch import Launcher
+from warp_dvct.passes.voxels import scan
+
+
+@dataclass(frozen=True)
+class GBuffer:
+    """Shading points of one picture.
+
+    Attributes:
+        points: ``Points``: entry ``p`` is pixel ``p``'s centre; then ``edge_samples`` points per edge pixel.
+        count: Points in all.
+        edge_rank: int ``[width * height]``, rank of an edge pixel or -1. Edge pixel of rank ``r`` owns points
+            ``width * height + r * edge_samples`` and on; a pixel without an edge is its centre alone.
+        behind: ``Points``: real surfaces behind the synthetic points, or None where they were not asked for.
+        behind_index: int, the entry of ``points`` in front of each of ``behind``.
+        behind_rank: int ``[count]``, the entry of ``behind`` for a point, or -1.
+        behind_count: Entries of ``behind``.
+    """
+
+    width: int
+    height: int
+    edge_samples: int
+    points: Any
+    count: int
+    edge_rank: Any
+    edge_pixel: Any
+    behind: Any
+    behind_index: Any
+    behind_rank: Any
+    behind_count: int
+
+
+def render_gbuffer(
+    launcher: Launcher, scene: DeviceScene, width: int, height: int, *, edge_samples: int, behind: bool, seed: int = 0
+) -> GBuffer:
+    """Trace the camera's rays.
+
+    Args:
+        edge_samples: Points per edge pixel, spread over its area (box filter); 0 for no anti-aliasing.
+        behind: Whether the real surfaces hidden by synthetic ones are needed (where there is no plate).
+    """
+    pixels = width * height
+    centers = new_points(launcher, pixels)
+    shared = [scene.geometry, scene.materials, scene.camera]
+    launcher.launch(kernels._see_centers, pixels, [*shared, width, height], [centers])
+    mark = launcher.zeros(pixels, wp.int32)
+    if edge_samples > 0:
+        launcher.launch(kernels._mark_edges, pixels, [centers, width, height], [mark])
+    edge_rank, edge_pixel, edges = compact(launcher, mark)
+    count = pixels + edges * edge_samples
+    points = extended(launcher, centers, pixels, count)
+    launcher.launch(
+        kernels._see_edges, edges * edge_samples, [*shared, edge_pixel, width, height, edge_samples, seed], [points]
+    )
+    hidden: tuple[Any, Any, Any, int] = (None, None, None, 0)
+    if behind:
+        hidden = _look_behind(launcher, scene, points, count, width)
+    return GBuffer(width, height, edge_samples, points, count, edge_rank, edge_pixel, *hidden)
+
+
+def compact(launcher: Launcher, mark: Any) -> tuple[Any, Any, int]:
+    """Rank of each marked element (-1 elsewhere), the marked elements in order, and their number."""
+    ends, total = scan(launcher, mark)
+    rank = launcher.empty(mark.shape[0], wp.int32)
+    listed = launcher.empty(max(total, 1), wp.int32)
+    launcher.launch(kernels._list_edges, mark.shape[0], [mark, ends], [rank, listed])
+    return rank, listed, total
+
+
+def new_points(launcher: Launcher, count: int) -> Any:
+    """Zeroed ``Points`` with room for ``count`` entries."""
+    points = Points()
+    for name, variable in Points.vars.items():
+        setattr(points, name, launcher.zeros(max(count, 1), variable.type.dtype))
+    return points
+
+
+def extended(launcher: Launcher, points: Any, old: int, count: int) -> Any:
+    """The first ``old`` entries of ``points`` in arrays of ``count`` entries."""
+    if count == old:
+        return points
+    larger = new_points(launcher, count)
+    for name in Points.vars:
+        wp.copy(getattr(larger, name), getattr(points, name), count=old)
+    return larger
+
+
+def _look_behind(launcher: Launcher, scene: DeviceScene, points: Any, count: int, width: int) -> tuple[Any, Any, Any, int]:
+    mark = launcher.zeros(count, wp.int32)
+    launcher.launch(kernels._mark_synthetic, count, [points], [mark])
+    rank, index, hidden = compact(launcher, mark)
+    behind = new_points(launcher, hidden)
+    launcher.launch(
+        kernels._see_behind, hidden, [scene.geometry, scene.materials, scene.camera, points, index, width], [behind]
+    )
+    return behind, index, rank, hidden

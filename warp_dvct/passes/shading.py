@@ -1,0 +1,42 @@
+"""Direct light at shading points."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from warp_dvct.device_scene import DeviceScene
+from warp_dvct.kernels import shading as kernels
+from warp_dvct.launch import Launcher
+
+
+def shade_direct(
+    launcher: Launcher,
+    scene: DeviceScene,
+    points: Any,
+    count: int,
+    direct: Any,
+    *,
+    light: Any,
+    before: Any,
+    world: Any = None,
+    cone: Any = None,
+) -> None:
+    """Write the direct light of ``count`` points to ``light`` (and ``before``), both vec3 ``[count]``.
+
+    Args:
+        direct: ``kernels.shading.Direct``.
+        world, cone: Volumes and settings for shadow cones; exact shadow rays where ``cone`` is None.
+
+    Franke 2014, eqs. 5 and 7: after on synthetic points, after - before on real ones. Domes are left to the gather.
+    """
+    if cone is None:
+        launcher.launch(
+            kernels._shade_direct, count, [points, scene.geometry, scene.lights, direct], [light, before]
+        )
+    else:
+        launcher.launch(
+            kernels._shade_direct_cones,
+            count,
+            [points, world.fine, world.coarse, world.has_coarse, cone, scene.lights, direct],
+            [light, before],
+        )

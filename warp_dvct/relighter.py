@@ -1,0 +1,231 @@
+"""Relighter: opens a stage, plans, keeps device data between frames, renders frames."""
+
+from __future__ import annotations
+
+import hashlib
+import time as clock
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from warp_dvct.device_scene import DeviceScene, camera_frame
+from warp_dvct.errors import OptionError
+from warp_dvct.launch import Launcher
+from warp_dvct.layers import Layers, Radiance
+from warp_dvct.methods import delta_cone_tracing, path_tracing
+from warp_dvct.passes.composite import composite
+from warp_dvct.plan import Plan, make_plan
+from warp_dvct.scene import Scene
+from warp_dvct.settings import make_settings
+
+METHODS = ("delta-cones", "path-trace")
+DEFAULT_WIDTH = 960
+
+Progress = Callable[[str, float], None]
+
+
+class Relighter:
+    """Inserts a stage's synthetic objects into its real scene, frame after frame.
+
+    Args:
+        stage: Path of a USD stage, an open ``Usd.Stage``, or a ``Scene``.
+        method: ``delta-cones`` or ``path-trace`` (the truth).
+        quality: ``draft``, ``balanced`` or ``high``.
+        settings: Single knobs by dotted name (``warp_dvct.settings``), over the quality's preset.
+        camera: Prim path of the camera; needed where the stage has several.
+        width, height: Picture size in pixels; by default the stage's render settings or 960, and the camera's aspect.
+        time: Time code; None for the default time.
+        device: ``cpu``, ``cuda`` or ``cuda:N``. threads: CPU threads; None for all cores.
+        real, synthetic: Prim paths whose role is set against what the stage says.
+        strict: Treat anything in the stage that is not modelled as an error.
+    Raises:
+        StageError: The stage cannot be read. OptionError: An unknown or unsuitable argument.
+        DeviceError: The device is absent or out of memory.
+    """
+
+    def __init__(
+        self,
+        stage: Any,
+        *,
+        method: str = "delta-cones",
+        quality: str = "balanced",
+        settings: Mapping[str, Any] | None = None,
+        camera: str | None = None,
+        width: int | None = None,
+        height: int | None = None,
+        time: float | None = None,
+        device: str = "cpu",
+        threads: int | None = None,
+        real: Sequence[str] = (),
+        synthetic: Sequence[str] = (),
+        strict: bool = False,
+        purposes: Sequence[str] = ("default", "render"),
+    ) -> None:
+        if method not in METHODS:
+            raise OptionError(f"method is '{method}'; choose one of {', '.join(METHODS)}")
+        self.settings = make_settings(quality, settings)
+        self.method = method
+        self._launcher = Launcher(device, threads)
+        self._stage = stage
+        self._reading = {
+            "camera": camera,
+            "real": real,
+            "synthetic": synthetic,
+            "strict": strict,
+            "purposes": purposes,
+        }
+        self._size = (width, height)
+        self._kept: tuple[str, DeviceScene, delta_cone_tracing.LightField | None] | None = None
+        self.stats: dict[str, Any] = {}
+        self.load_seconds = 0.0
+        self.set_time(time)
+
+    def set_time(self, time: float | None) -> None:
+        """Read the stage at another time code; what did not change stays on the device."""
+        start = clock.perf_counter()
+        if isinstance(self._stage, Scene):
+            self.scene = self._stage
+        else:
+            from warp_dvct.usd.read import read_stage
+
+            self.scene = read_stage(self._stage, time=time, **self._reading)
+        self.load_seconds = clock.perf_counter() - start
+        self.width, self.height = self._picture_size()
+        self._plan(has_plate=self.scene.plate is not None)
+
+    @property
+    def plan(self) -> Plan:
+        """What the next frame will do."""
+        return self._current_plan
+
+    def render(self, plate: np.ndarray | None = None, *, progress: Progress | None = None) -> Layers:
+        """Render the current frame.
+
+        Args:
+            plate: The photograph, linear float32 ``[height, width, 3]``; without one the rendered 'before' is the plate.
+            progress: Called with the pass's name and the share of the frame that is done.
+        """
+        if plate is not None and plate.shape != (self.height, self.width, 3):
+            raise OptionError(f"the plate has shape {plate.shape}; the picture needs {(self.height, self.width, 3)}")
+        report = progress or (lambda name, share: None)
+        launcher = self._launcher
+        launcher.reset_times()
+        compiled = launcher.compile_seconds
+        start = clock.perf_counter()
+        self._plan(has_plate=plate is not None)
+        if self.method == "path-trace":
+            radiance = self._path_trace(report)
+        else:
+            radiance = self._delta_cones(plate is None, report)
+        report("composite", 0.95)
+        with launcher.scope("composite"):
+            layers = composite(launcher, radiance, plate)
+        spent = clock.perf_counter() - start
+        report("done", 1.0)
+        self.stats = {
+            "load_seconds": self.load_seconds,
+            "compile_seconds": launcher.compile_seconds,
+            "render_seconds": spent - (launcher.compile_seconds - compiled),
+            "passes": dict(launcher.pass_seconds),
+            "peak_bytes": launcher.peak_bytes,
+            "plan": self.plan.to_dict(),
+            "notices": [str(n) for n in self.scene.notices],
+        }
+        return layers
+
+    def _plan(self, *, has_plate: bool) -> None:
+        self._current_plan = make_plan(
+            self.scene, self.settings, self.method, self.width, self.height, has_plate=has_plate
+        )
+
+    def _picture_size(self) -> tuple[int, int]:
+        width, height = self._size
+        aspect = self.scene.camera.aspect
+        if width is None:
+            width = DEFAULT_WIDTH if height is None else max(1, round(height * aspect))
+        if height is None:
+            height = max(1, round(width / aspect))
+        if width < 1 or height < 1:
+            raise OptionError(f"the picture is {width} x {height}; give sizes of at least 1 pixel")
+        return width, height
+
+    def _device_scene(self) -> DeviceScene:
+        """The scene on the device: the kept one, with the camera of this frame, where nothing else changed."""
+        key = _content_key(self.scene, self.plan)
+        if self._kept is None or self._kept[0] != key:
+            with self._launcher.scope("upload"):
+                self._kept = None  # free the old one first
+                uploaded = DeviceScene.upload(
+                    self._launcher, self.scene, np.asarray(self.plan.origin), self.plan.scale
+                )
+            self._kept = (key, uploaded, None)
+        device_scene = self._kept[1]
+        frame = camera_frame(self.scene.camera, np.asarray(self.plan.origin), self.plan.scale)
+        return replace(device_scene, camera=frame)
+
+    def _delta_cones(self, with_before: bool, report: Progress) -> Radiance:
+        report("volumes", 0.0)
+        device_scene = self._device_scene()
+        assert self._kept is not None
+        light_field = self._kept[2]
+        if light_field is None:
+            light_field = delta_cone_tracing.light_volumes(self._launcher, self.scene, device_scene, self.plan)
+            self._kept = (self._kept[0], self._kept[1], light_field)
+        report("shading", 0.5)
+        return delta_cone_tracing.render(
+            self._launcher, self.scene, device_scene, light_field, self.plan, with_before=with_before
+        )
+
+    def _path_trace(self, report: Progress) -> Radiance:
+        device_scene = self._device_scene()
+        with self._launcher.scope("path trace"):
+            return path_tracing.path_trace(
+                self._launcher,
+                device_scene,
+                self.scene,
+                self.width,
+                self.height,
+                samples=self.settings.samples,
+                bounces=self.settings.bounces,
+                seed=self.settings.seed,
+                progress=lambda done, total: report("path trace", 0.95 * done / total),
+            )
+
+
+def _content_key(scene: Scene, plan: Plan) -> str:
+    """Hash of all that uploaded data and lit volumes depend on: everything but camera, plate and picture size."""
+    digest = hashlib.blake2b(digest_size=16)
+
+    def feed(value: Any) -> None:
+        if isinstance(value, np.ndarray):
+            digest.update(str((value.shape, value.dtype)).encode())
+            digest.update(np.ascontiguousarray(value).data)
+        elif hasattr(value, "__dataclass_fields__"):
+            for name in value.__dataclass_fields__:
+                feed(getattr(value, name))
+        elif isinstance(value, tuple):
+            digest.update(str(len(value)).encode())
+            for item in value:
+                feed(item)
+        else:
+            digest.update(repr(value).encode() + b"\0")
+
+    feed((scene.meshes, scene.materials, scene.textures, scene.lights))
+    feed((plan.settings, plan.origin, plan.scale, plan.fine, plan.coarse, plan.start, plan.maps))
+    feed(tuple(p.needed for p in plan.passes if p.name in ("voxelize", "pyramid", "bounces")))
+    return digest.hexdigest()
+
+
+def relight(stage: Any, *, plate: np.ndarray | None = None, **options: Any) -> Layers:
+    """Insert a stage's synthetic objects into its real scene and return the finished layers.
+
+    Args:
+        stage: Path of a USD stage, an open ``Usd.Stage``, or a ``Scene``.
+        plate: The photograph, linear float32 ``[height, width, 3]``; by default the rendered real scene.
+        options: As for :class:`Relighter`.
+    """
+    return Relighter(stage, **options).render(plate)
+
+

@@ -1,0 +1,152 @@
+"""Every knob of every method: its name, default, range and presets.
+
+Names are dotted (``volume.resolution``); as attributes of :class:`Settings` the dot is an underscore.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+from warp_dvct.errors import OptionError
+
+QUALITIES = ("draft", "balanced", "high")
+
+
+def _knob(default: Any, help: str, *, low: float = -math.inf, high: float = math.inf, choices: tuple[str, ...] = ()) -> Any:
+    return field(default=default, metadata={"help": help, "low": low, "high": high, "choices": choices})
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All knobs, at their ``balanced`` values unless said otherwise; :func:`make_settings` applies presets."""
+
+    seed: int = _knob(0, "seed of every random number", low=0, high=2**31 - 1)
+    bounces: int = _knob(6, "indirect bounces: 0 direct light only, 1 the paper's single bounce", low=0, high=64)
+    antialias: int = _knob(4, "shading points per edge pixel; 0 for none", low=0, high=64)
+
+    volume_resolution: int = _knob(256, "voxels an edge of the fine volume", low=1, high=1024)
+    volume_scale: float = _knob(2.0, "edge of the fine volume over the synthetic bounding box's largest", low=1.0, high=1e3)
+    volume_coarse: int = _knob(128, "voxels an edge of the volume around the fine one; 0 for none", low=0, high=1024)
+    volume_reach: float = _knob(16.0, "largest edge of the coarse volume, in edges of the fine one", low=1.0, high=1e4)
+
+    rsm_texels: int = _knob(1024, "most texels an edge of a reflective shadow map", low=1, high=8192)
+    rsm_density: float = _knob(1.0, "texels per voxel edge at the volume's far side", low=0.01, high=16.0)
+
+    shadows: str = _knob("ray", "how direct shadows are found", choices=("ray", "cone"))
+    shadows_samples: int = _knob(16, "samples per light and shading point", low=1, high=4096)
+
+    gather: str = _knob("rays", "how diffuse indirect light is gathered", choices=("rays", "cones"))
+    gather_rays: int = _knob(64, "rays per gather point on real surfaces", low=1, high=65536)
+    gather_stride: int = _knob(4, "pixels between gather points on real surfaces; 1 for every pixel", low=1, high=64)
+    gather_object_rays: int = _knob(64, "rays per gather point on synthetic surfaces", low=1, high=65536)
+    gather_object_stride: int = _knob(2, "pixels between gather points on synthetic surfaces", low=1, high=64)
+    gather_radius: int = _knob(2, "gather points to each side that reconstruction looks at", low=0, high=16)
+
+    cones_count: int = _knob(9, "diffuse cones", low=4, high=36)
+    cones_aperture: float = _knob(0.0, "full opening angle of a diffuse cone [degrees]; 0 by count", low=0.0, high=179.0)
+    cones_step: float = _knob(1.0, "march step in voxels of the current level", low=0.05, high=8.0)
+    cones_start: float = _knob(1.5, "distance from the surface at which a march starts [voxels]", low=0.0, high=64.0)
+    cones_filter: str = _knob("directional", "how the pyramid is filtered", choices=("directional", "isotropic"))
+    cones_delta: str = _knob("dual", "both occupancies in one march, or the paper's V-delta", choices=("dual", "split"))
+    cones_coverage: str = _knob("additive", "how coverage adds up along a cone", choices=("additive", "product"))
+
+    glossy: str = _knob("rays", "how specular reflections are found", choices=("rays", "cones"))
+    glossy_rays: int = _knob(8, "rays per shading point with a specular lobe", low=1, high=65536)
+    glossy_roughness: float = _knob(0.7, "rougher lobes are folded into the diffuse gather", low=0.0, high=1.0)
+
+    patches_count: int = _knob(8192, "about how many patches carry the second and further bounces", low=8, high=2**22)
+    patches_rays: int = _knob(64, "rays per patch", low=1, high=65536)
+
+    samples: int = _knob(64, "path-trace: samples per pixel", low=1, high=2**20)
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "draft": {
+        "bounces": 1,
+        "volume.resolution": 64,
+        "volume.coarse": 64,
+        "rsm.texels": 256,
+        "shadows.samples": 4,
+        "gather.rays": 24,
+        "gather.stride": 6,
+        "gather.object_rays": 24,
+        "gather.object_stride": 3,
+        "glossy.rays": 2,
+        "patches.count": 2048,
+        "patches.rays": 32,
+        "samples": 16,
+    },
+    "balanced": {},
+    "high": {
+        "bounces": 12,
+        "antialias": 8,
+        "shadows.samples": 64,
+        "rsm.texels": 2048,
+        "rsm.density": 1.5,
+        "gather.rays": 256,
+        "gather.stride": 3,
+        "gather.object_rays": 256,
+        "gather.object_stride": 1,
+        "glossy.rays": 32,
+        "patches.count": 16384,
+        "patches.rays": 128,
+        "samples": 512,
+    },
+}
+
+_FIELDS = {f.name: f for f in fields(Settings)}
+# A dot stands only where the first word names a group, so that ``gather_object_rays`` is ``gather.object_rays``.
+NAMES = {f.replace("_", ".", 1): f for f in _FIELDS}
+
+
+def make_settings(quality: str = "balanced", overrides: Mapping[str, Any] | None = None) -> Settings:
+    """Settings of a preset with single knobs changed.
+
+    Args:
+        quality: ``draft``, ``balanced`` or ``high``.
+        overrides: Dotted names to values; strings are converted.
+    Raises:
+        OptionError: An unknown quality or knob (the nearest is suggested), or a value outside its range.
+    """
+    if quality not in QUALITIES:
+        raise OptionError(f"quality is '{quality}'; choose one of {', '.join(QUALITIES)}")
+    values: dict[str, Any] = {}
+    for name, value in {**PRESETS[quality], **dict(overrides or {})}.items():
+        if name not in NAMES:
+            near = difflib.get_close_matches(name, NAMES, 1, 0.4)
+            hint = f"; did you mean '{near[0]}'?" if near else ""
+            raise OptionError(f"there is no setting '{name}'{hint} (all: {', '.join(NAMES)})")
+        values[NAMES[name]] = _convert(name, value)
+    return replace(Settings(), **values)
+
+
+def _convert(name: str, value: Any) -> Any:
+    knob = _FIELDS[NAMES[name]]
+    kind = type(knob.default)
+    try:
+        converted = kind(value) if not (kind is int and isinstance(value, float) and value != int(value)) else None
+    except (TypeError, ValueError):
+        converted = None
+    if converted is None:
+        raise OptionError(f"{name}={value!r} is not {'a whole number' if kind is int else 'a number'}")
+    if knob.metadata["choices"]:
+        if converted not in knob.metadata["choices"]:
+            raise OptionError(f"{name}={value!r}; choose one of {', '.join(knob.metadata['choices'])}")
+    elif not knob.metadata["low"] <= converted <= knob.metadata["high"]:
+        raise OptionError(f"{name}={value} is outside {knob.metadata['low']:g} … {knob.metadata['high']:g}")
+    return converted
+
+
+def describe_settings() -> str:
+    """One line per knob: name, default, range or choices, meaning."""
+    lines = []
+    for name, attribute in NAMES.items():
+        knob = _FIELDS[attribute]
+        meta = knob.metadata
+        span = "|".join(meta["choices"]) if meta["choices"] else f"{meta['low']:g}…{meta['high']:g}"
+        lines.append(f"{name}={knob.default} ({span}): {meta['help']}")
+    return "\n".join(lines)
