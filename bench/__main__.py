@@ -11,6 +11,7 @@ from typing import Any
 
 import click
 
+from warp_dvct.cli.quiet import start_warp
 from warp_dvct.errors import DvctError, OptionError
 from warp_dvct.image import write_text
 from warp_dvct.usd_scenes import cache_folder
@@ -52,6 +53,7 @@ def error(
     stages: tuple[str, ...], pairs: tuple[str, ...], json_file: Path | None, spp: int, cache: Path | None, **rest
 ):
     """Compare a method with the path-traced truth (kept in a cache) and with two baselines."""
+    start_warp(rest["device"])
     from warp_dvct.bench import error as module
 
     cache = cache or cache_folder() / "references"
@@ -69,12 +71,14 @@ def error(
 @click.option("--runs", type=int, default=3, show_default=True, help="Warm runs per row; the median is printed.")
 @click.option("--width", type=int, default=1280, show_default=True)
 @click.option("--height", type=int, default=720, show_default=True)
+@click.option("--preset", is_flag=True, help="Our own preset's passes instead of the paper's cones and single bounce.")
 @_shared
-def table1(quality: str, pairs: tuple[str, ...], json_file: Path | None, **rest):
+def table1(quality: str, preset: bool, pairs: tuple[str, ...], json_file: Path | None, **rest: Any) -> None:
     """The paper's Table 1 (256^3 voxels, 720p, RSM of 1024^2) with this machine's times beside."""
+    start_warp(rest["device"])
     from warp_dvct.bench import table1 as module
 
-    settings = {**module.PAPER_SETTINGS, **settings_of(pairs)}
+    settings = {**module.SIZE_SETTINGS, **({} if preset else module.PAPER_SETTINGS), **settings_of(pairs)}
     times = [module.measure(v, quality=quality, settings=settings, **rest) for v in module.VARIANTS]
     shown = " ".join(f"{k}={v}" for k, v in settings.items())
     title = f"Table 1, {rest['width']}x{rest['height']}, {quality}, {shown}, median of {rest['runs']}, {rest['device']}"
@@ -122,7 +126,7 @@ def main() -> None:
     try:
         bench(prog_name="python -m warp_dvct.bench")
     except DvctError as problem:
-        click.echo(f"error: {problem}", err=True)
+        click.echo(f"bench: error: {problem}", err=True)
         sys.exit(1)
 
 

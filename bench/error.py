@@ -89,8 +89,7 @@ def measure(stage: str, options: ErrorOptions) -> Report:
     if options.width < 16:
         raise OptionError(f"--width is {options.width}; FLIP needs pictures of at least 16 pixels")
     launcher = Launcher(options.device, options.threads)
-    file = stage_file(stage)
-    scene = read(file)
+    scene = read(stage_file(stage))
     height = max(1, round(options.width / scene.camera.aspect))
     store = ReferenceStore(
         scene,
@@ -108,7 +107,7 @@ def measure(stage: str, options: ErrorOptions) -> Report:
         ("many bounces", options.bounces, {}),
     ):
         truth = store.get(bounces)
-        layers, seconds = _relight(file, options, {**options.settings, **overrides}, truth.before)
+        layers, seconds = _relight(scene, options, {**options.settings, **overrides}, truth.before)
         pictures = {
             f"{options.method} {options.quality}": (layers, seconds),
             PASTED: (combine(truth.before, np.zeros_like(direct.delta), direct.synthetic), None),
@@ -142,13 +141,13 @@ def read(file: Path) -> Scene:
 
 
 def _relight(
-    file: Path, options: ErrorOptions, settings: dict[str, str], plate: np.ndarray
+    scene: Scene, options: ErrorOptions, settings: dict[str, str], plate: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """The composite, and the seconds of a frame without loading and compiling."""
     from warp_dvct.relighter import Relighter
 
     relighter = Relighter(
-        file,
+        scene,
         method=options.method,
         quality=options.quality,
         settings=settings,
