@@ -123,7 +123,7 @@ def test_plate_of_the_camera_follows_time_and_is_overridden(build, tmp_path):
     assert build.read(time=1.9).plate == str(files[0])
     assert build.read(time=2.0).plate == str(files[1])
     assert build.read(time=1.0, plate=str(files[2])).plate == str(files[2])
-    with pytest.raises(FileError, match="plate 'nowhere.png' does not exist"):
+    with pytest.raises(FileError, match=r"plate 'nowhere.png' does not exist"):
         build.read(plate="nowhere.png")
     plate.Set(Sdf.AssetPath("lost.png"), 3.0)
     with pytest.raises(StageError, match=r"/World/Camera.dvct:plate:file: plate 'lost.png' does not exist"):

@@ -208,7 +208,7 @@ def test_subdivision_meshes_are_listed_and_smooth_but_keep_hard_edges(build, mea
     n = 24
     angle = np.arange(n) / n * 2 * np.pi
     ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
-    points = np.concatenate([ring, ring + [0, 0, 1]])
+    points = np.concatenate([ring, ring + np.array([0, 0, 1])])
     sides = [[k, (k + 1) % n, n + (k + 1) % n, n + k] for k in range(n)]
     build.mesh(points, sides, "/World/Tube", "catmullClark")
     build.mesh(CUBE_POINTS, CUBE_FACES, "/World/Box", "catmullClark")

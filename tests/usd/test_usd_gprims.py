@@ -44,21 +44,18 @@ def test_area_and_volume_are_those_of_the_true_shape(build, measure, kind):
 @pytest.mark.parametrize("kind", SHAPES)
 @pytest.mark.parametrize("axis", ["X", "Y", "Z"])
 def test_the_axis_turns_the_shape_without_mirroring_it(build, measure, kind, axis):
-    if kind in ("Cube", "Sphere"):
-        return_axis = None
-    else:
-        return_axis = "XYZ".index(axis)
+    along = None if kind in ("Cube", "Sphere") else "XYZ".index(axis)
     values, _, volume = SHAPES[kind]
-    define(build, kind, **values, **({} if return_axis is None else {"axis": axis}))
+    define(build, kind, **values, **({} if along is None else {"axis": axis}))
     mesh = build.one("/World/Shape")
     assert measure.volume(mesh) == pytest.approx(volume, rel=2.5e-3)
     extent = np.ptp(mesh.points, axis=0)
-    if return_axis is not None:
+    if along is not None:
         height = values["height"] + (2 * values.get("radius", 1.0) if kind.startswith("Capsule") else 0.0)
-        assert extent[return_axis] == pytest.approx(height)
+        assert extent[along] == pytest.approx(height)
     if kind in ("Cone", "Cylinder_1"):  # the narrow end points along +axis
-        radius = np.linalg.norm(np.delete(mesh.points, return_axis, 1), axis=1)
-        top = mesh.points[:, return_axis] > 0
+        radius = np.linalg.norm(np.delete(mesh.points, along, 1), axis=1)
+        top = mesh.points[:, along] > 0
         assert radius[top].max() < radius[~top].max() - 0.5
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,10 @@ from warp_dvct.usd.context import Notices
 
 if TYPE_CHECKING:
     from pxr import Usd
+
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)"
+FRAME_ROUNDING = 1e-6  # strides ahead of the last frame that still count as reaching it
+MAX_FRAMES = 1_000_000
 
 
 def open_stage(source: str | Path | Usd.Stage) -> Usd.Stage:
@@ -120,21 +125,26 @@ def _open_unloaded(source: str | os.PathLike) -> Usd.Stage:
 def stage_frames(spec: str) -> list[float]:
     """Time codes of a frame specification, as usdrecord's ``--frames``: ``"1:10x2,20"`` is 1, 3, 5, 7, 9, 20.
 
-    Raises:
-        OptionError: A part is neither ``FRAME``, ``FIRST:LAST`` nor ``FIRST:LASTxSTRIDE``.
-    """
-    from pxr import Tf, UsdUtils
+    Parsed here: UsdUtils.TimeCodeRange crashes on some malformed specifications.
 
-    frames: list[float] = []
+    Raises:
+        OptionError: A part is neither ``FRAME``, ``FIRST:LAST`` nor ``FIRST:LASTxSTRIDE``, or the stride leads away
+            from the last frame.
+    """
+    frames: dict[float, None] = {}
     for part in spec.split(","):
-        try:
-            codes = UsdUtils.TimeCodeRange.CreateFromFrameSpec(part.strip())
-        except Tf.ErrorException as error:
+        match = re.fullmatch(rf"({NUMBER})(?::({NUMBER})(?:x({NUMBER}))?)?", part.strip())
+        if match is None:
             raise OptionError(
                 f"--frames {spec!r}: {part.strip()!r} is not understood; write 5, 1:10 or 1:10x2, separated by commas"
-            ) from error
-        values = [code.GetValue() for code in codes]
-        if not values or not np.isfinite(values).all():
-            raise OptionError(f"--frames {spec!r}: {part.strip()!r} gives no frame; write 5, 1:10 or 1:10x2")
-        frames += [value for value in values if value not in frames]
-    return frames
+            )
+        first = float(match[1])
+        last = float(match[2]) if match[2] else first
+        stride = float(match[3]) if match[3] else (1.0 if last >= first else -1.0)
+        if stride == 0.0 or (last - first) * stride < 0.0:
+            raise OptionError(f"--frames {spec!r}: a stride of {stride:g} never leads from {first:g} to {last:g}")
+        count = int((last - first) / stride + FRAME_ROUNDING) + 1
+        if count > MAX_FRAMES:
+            raise OptionError(f"--frames {spec!r}: {count} frames; give at most {MAX_FRAMES} at a time")
+        frames.update(dict.fromkeys(first + k * stride for k in range(count)))
+    return list(frames)

@@ -78,7 +78,9 @@ def _read_image(file: str, owner: str) -> np.ndarray:
     """uint8 as stored for 8-bit files, else float32; ``[h, w, c]``."""
     import OpenImageIO as oiio
 
-    source: Any = oiio.ImageInput.open(file)
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)  # a material reads the channels as stored, not times alpha
+    source: Any = oiio.ImageInput.open(file, config)
     if source is None:
         raise StageError(f"{owner}: '{file}' cannot be read as an image ({oiio.geterror().strip()}); replace the file")
     try:
