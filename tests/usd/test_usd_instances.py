@@ -149,6 +149,13 @@ def test_prototypes_below_the_instancer_are_not_drawn_by_themselves(build):
     assert [m.path for m in meshes] == ["/World/Room", f"{points.GetPath()}/Ball"]
 
 
+def test_colours_per_instance_are_listed(build):
+    points = instancer(build, [(0, 0, 0), (3, 0, 0)])
+    color = UsdGeom.PrimvarsAPI(points).CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, "vertex")
+    color.Set([(1, 0, 0), (0, 1, 0)])
+    assert [(n.path, "per instance" in n.message) for n in build.read().notices] == [("/World/Bricks", True)]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

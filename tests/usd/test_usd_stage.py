@@ -165,6 +165,14 @@ def test_what_could_not_be_composed_is_listed_and_strict_refuses_it(build, tmp_p
         build.read(strict=True)
 
 
+def test_an_error_also_names_the_file_that_did_not_load(build):
+    build.stage.RemovePrim("/World/Room")
+    build.quad()
+    build.stage.DefinePrim("/World/Set").GetReferences().AddReference("/nowhere/set.usd")
+    with pytest.raises(StageError, match=r"no geometry is real; .*\(/World/Set: not composed: .*set.usd"):
+        build.read(allow_empty_roles=False)
+
+
 def test_strict_accepts_a_stage_without_notices(build):
     build.quad()
     assert build.read(strict=True).notices == ()

@@ -209,8 +209,9 @@ class Collector:
             raise StageError(f"{path}: NaN or infinite values in its positions, orientations or scales")
         mask = np.array(instancer.ComputeMaskAtTime(time), dtype=bool)
         shown = mask if len(mask) else np.ones(len(index), bool)
-        if UsdGeom.PrimvarsAPI(instancer).GetPrimvar("displayColor").HasAuthoredValue():
-            self._ctx.notices.add(path, "displayColor on a PointInstancer is not used; the prototypes' own is")
+        color = UsdGeom.PrimvarsAPI(instancer).GetPrimvar("displayColor")
+        if color.HasAuthoredValue() and color.GetInterpolation() != UsdGeom.Tokens.constant:
+            self._ctx.notices.add(path, "displayColor per instance is not supported; the prototypes' own is used")
         for k, target in enumerate(targets):
             prim = self._ctx.stage.GetPrimAtPath(target)
             if not prim:

@@ -13,7 +13,7 @@ import numpy as np
 from warp_dvct.errors import StageError
 from warp_dvct.scene import Light, Mesh, Notice, Scene
 from warp_dvct.usd.camera import choose_camera, read_camera, read_plate
-from warp_dvct.usd.collect import Collector, Placed
+from warp_dvct.usd.collect import Collection, Collector, Placed
 from warp_dvct.usd.context import Context, shared_path
 from warp_dvct.usd.geometry import LocalMesh, WorldTriangles, place, read_local
 from warp_dvct.usd.lights import read_lights
@@ -64,38 +64,50 @@ def read_stage(
     from pxr import Usd
 
     stage = open_stage(path)
-    images = images or ImageCache()
     with quiet_diagnostics():
         metres, frame = world_frame(stage)
         code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(time)
         ctx = Context(stage, code, metres, frame)
         note_composition_errors(stage, ctx.notices)
-        eye = choose_camera(ctx, camera)
-        view = read_camera(eye, ctx)
-        found = Collector(ctx, Roles(ctx, real, synthetic, render_pass), tuple(purposes)).collect()
-        if not allow_empty_roles:
-            require_roles(stage, found.defined)
-        if not found.lights_defined:
-            raise StageError(f"{name_of(stage)} has no light; add a UsdLux light")
-        materials = Materials(ctx, images)
-        meshes = _MeshBuilder(ctx, materials).build(found.geometry)
-        lights: list[Light] = []
-        for placed in found.lights:
-            lights += read_lights(placed, ctx, images)
-        if found.lights and not lights:
-            raise StageError(f"{name_of(stage)} has no light of a supported type; {_list(ctx.notices.all())}")
-        scene = Scene(
-            tuple(meshes),
-            tuple(materials.materials),
-            tuple(materials.textures),
-            tuple(lights),
-            view,
-            read_plate(eye, ctx, plate),
-            ctx.notices.all(),
-        )
+        broken = ctx.notices.all()
+        try:
+            eye = choose_camera(ctx, camera)
+            found = Collector(ctx, Roles(ctx, real, synthetic, render_pass), tuple(purposes)).collect()
+            if not allow_empty_roles:
+                require_roles(stage, found.defined)
+            scene = _assemble(ctx, eye, found, plate, images or ImageCache())
+        except StageError as error:
+            # What is missing is often in the file that did not load.
+            if not broken:
+                raise
+            raise StageError(f"{error} ({_list(broken)})") from error
     if strict and scene.notices:
         raise StageError(f"{name_of(stage)}: --strict, and this is not modelled: {_list(scene.notices)}")
     return scene
+
+
+def _assemble(
+    ctx: Context, eye: Usd.Prim, found: Collection, plate: str | os.PathLike | None, images: ImageCache
+) -> Scene:
+    """Read everything that the walk found."""
+    if not found.lights_defined:
+        raise StageError(f"{name_of(ctx.stage)} has no light; add a UsdLux light")
+    materials = Materials(ctx, images)
+    meshes = _MeshBuilder(ctx, materials).build(found.geometry)
+    lights: list[Light] = []
+    for placed in found.lights:
+        lights += read_lights(placed, ctx, images)
+    if found.lights and not lights:
+        raise StageError(f"{name_of(ctx.stage)} has no light of a supported type; {_list(ctx.notices.all())}")
+    return Scene(
+        meshes=tuple(meshes),
+        materials=tuple(materials.materials),
+        textures=tuple(materials.textures),
+        lights=tuple(lights),
+        camera=read_camera(eye, ctx),
+        plate=read_plate(eye, ctx, plate),
+        notices=ctx.notices.all(),
+    )
 
 
 def _list(notices: Sequence[Notice]) -> str:
