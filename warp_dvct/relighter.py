@@ -144,12 +144,20 @@ class Relighter:
         width, height = self._size
         aspect = self.scene.camera.aspect
         if width is None:
-            width = DEFAULT_WIDTH if height is None else max(1, round(height * aspect))
+            width = self._default_width() if height is None else max(1, round(height * aspect))
         if height is None:
             height = max(1, round(width / aspect))
         if width < 1 or height < 1:
             raise OptionError(f"the picture is {width} x {height}; give sizes of at least 1 pixel")
         return width, height
+
+    def _default_width(self) -> int:
+        if isinstance(self._stage, Scene):
+            return DEFAULT_WIDTH
+        from warp_dvct.usd.render import product_resolution
+
+        authored = product_resolution(self._stage, self.scene.camera.path)
+        return authored[0] if authored else DEFAULT_WIDTH
 
     def _device_scene(self) -> DeviceScene:
         """The scene on the device: the kept one, with the camera of this frame, where nothing else changed."""
