@@ -13,7 +13,17 @@ from warp_dvct.bench.references import Reference, ReferenceStore, combine
 from warp_dvct.errors import FileError, OptionError
 from warp_dvct.image import write_png
 from warp_dvct.launch import Launcher
-from warp_dvct.metrics import REGIONS, affected_mask, flip_ldr, import_flip, region_masks, rel_mse, rmse, to_display
+from warp_dvct.metrics import (
+    REGIONS,
+    affected_mask,
+    flip_ldr,
+    import_flip,
+    region_masks,
+    rel_mse,
+    rmse,
+    smooth_delta,
+    to_display,
+)
 from warp_dvct.usd_scenes import names, path
 
 if TYPE_CHECKING:
@@ -162,8 +172,9 @@ def _relight(
 
 def _masks(truth: Reference, direct: Reference, glossy: np.ndarray) -> dict[str, np.ndarray]:
     picture = np.ones(glossy.shape, bool)
-    affected = affected_mask(truth.delta, truth.coverage)
-    regions = region_masks(direct.delta, truth.delta, truth.coverage, glossy)
+    delta, delta_direct = (smooth_delta(r.delta, truth.coverage) for r in (truth, direct))
+    affected = affected_mask(delta, truth.coverage)
+    regions = region_masks(delta_direct, delta, truth.coverage, glossy)
     return {"picture": picture, "affected": affected, **regions}
 
 

@@ -73,6 +73,21 @@ def import_flip():
     return flip_evaluator
 
 
+def smooth_delta(delta: np.ndarray, coverage: np.ndarray, radius: int = 2) -> np.ndarray:
+    """Mean of ``delta`` over the real part of the pixels in a square around each, for masks of a noisy truth.
+
+    A threshold on single noisy pixels would count noise as change. The mean is taken over pixels that synthetic
+    objects do not cover and is 0 where there is none.
+
+    Args:
+        delta: ``[h, w, 3]``; coverage: ``[h, w]`` in [0, 1]; radius: Pixels to each side.
+    """
+    free = (coverage <= 0).astype(np.float64)[..., None]
+    padded = np.pad(np.concatenate([delta * free, free], -1), ((radius, radius), (radius, radius), (0, 0)))
+    sums = np.lib.stride_tricks.sliding_window_view(padded, (2 * radius + 1, 2 * radius + 1), (0, 1)).sum((-2, -1))
+    return np.where(sums[..., 3:] > 0, sums[..., :3] / np.maximum(sums[..., 3:], 1), 0.0)
+
+
 def affected_mask(delta_true: np.ndarray, coverage: np.ndarray, threshold: float = AFFECTED) -> np.ndarray:
     """Pixels that the inserted objects change: a channel of the true delta beyond ``threshold``, or covered at all."""
     return (np.abs(delta_true).max(axis=-1) > threshold) | (coverage > 0)

@@ -118,3 +118,18 @@ def test_region_masks():
     assert masks["shadow"][0].tolist() == [False, True, False, False, False, True]
     assert masks["bounce"][0].tolist() == [False, False, True, False, False, True]
     assert masks["reflection"][0].tolist() == [False, False, False, True, False, False]
+
+
+def test_smooth_delta_averages_noise_but_not_the_objects_pixels():
+    rng = np.random.default_rng(3)
+    coverage = np.zeros((40, 40))
+    coverage[:20] = 1
+    delta = np.where(coverage[..., None] > 0, 9.0, 0.05) + rng.normal(0, 0.01, (40, 40, 3))
+    smooth = metrics.smooth_delta(delta, coverage)
+    assert np.abs(smooth[20:] - 0.05).max() < 0.015
+    assert smooth[20:].std() < delta[20:].std() / 3
+    assert not smooth[:17].any()
+    constant = np.full((6, 6, 3), 0.3)
+    np.testing.assert_allclose(
+        metrics.smooth_delta(constant, np.zeros((6, 6))), 0.3, err_msg="up to the picture's edge"
+    )
