@@ -11,16 +11,17 @@ OPAQUE = wp.constant(0.999)  # a march ends when this share of the cone is cover
 
 DUAL = wp.constant(0)
 SPLIT = wp.constant(1)
-SPLIT_WITH_BEFORE = wp.constant(2)  # the same; the caller marches once more for the light before
 
 
 @wp.struct
 class ConeSettings:
     aperture: float  # full opening angle [rad]
     step: float  # in voxels of the current level
-    start: float  # first sample's distance, in level-0 voxels
+    detail: float  # voxel edge over the cone's diameter
+    start: float  # how far the march starts above its surface, in level-0 voxels
     reach: float  # farthest distance, in volume space
     additive: int  # 1: coverage adds up (surfaces); 0: eq. 4's product of transparencies
+    escape: int  # 1: an exact ray decides whether what the march left uncovered is open
     split: int  # DUAL, or the paper's single occupancy with the field's difference in ``before``
 
 
@@ -87,10 +88,21 @@ def accumulate(total: wp.vec4, value: wp.vec4, step: float, additive: int) -> wp
 
 
 @wp.func
-def inside_box(volume: Volume, position: wp.vec3) -> bool:
-    edge = volume.voxel * float(volume.n)
+def inside_box(volume: Volume, position: wp.vec3, margin: float) -> bool:
+    edge = volume.voxel * float(volume.n) + margin
     local = position - volume.low
-    return wp.min(local[0], wp.min(local[1], local[2])) >= 0.0 and wp.max(local[0], wp.max(local[1], local[2])) <= edge
+    return wp.min(local[0], wp.min(local[1], local[2])) >= -margin and wp.max(local[0], wp.max(local[1], local[2])) <= edge
+
+
+@wp.func
+def level_of(volume: Volume, width: float) -> int:
+    """The level whose voxels are no wider than a cone."""
+    return wp.clamp(int(wp.floor(wp.log2(wp.max(width / volume.voxel, 1.0)))), 0, volume.levels - 1)
+
+
+@wp.func
+def level_voxel(volume: Volume, level: int) -> float:
+    return volume.voxel * float(1 << level)
 
 
 @wp.func
@@ -106,28 +118,25 @@ def march_cone(
     total.before = wp.vec4(0.0, 0.0, 0.0, 0.0)
     total.after = wp.vec4(0.0, 0.0, 0.0, 0.0)
     spread = 2.0 * wp.tan(0.5 * cone.aperture)
-    t = float(cone.start * fine.voxel)
+    # A face just ahead is spread by the interpolation over a voxel behind it as well.
+    t = float(-wp.min(cone.start, 1.0) * fine.voxel)
     searching = bool(True)
     while searching and t < cone.reach:
-        width = wp.max(spread * t, fine.voxel)
+        width = wp.max(spread * cone.detail * t, fine.voxel)
         position = origin + direction * t
-        in_fine = inside_box(fine, position)
-        step = float(0.0)
+        level = level_of(fine, width)
+        step = cone.step * level_voxel(fine, level)
+        middle = position + direction * (0.5 * step)
         value = ConeResult()
-        if in_fine or has_coarse != 0:
-            voxel = fine.voxel
-            levels = fine.levels
-            if not in_fine:
-                voxel = coarse.voxel
-                levels = coarse.levels
-            level = wp.clamp(int(wp.floor(wp.log2(wp.max(width / voxel, 1.0)))), 0, levels - 1)
-            step = cone.step * voxel * float(1 << level)
+        if inside_box(fine, middle, wp.where(has_coarse != 0, 0.0, level_voxel(fine, level))):
+            value = sample_volume(fine, level, middle, direction)
+        elif has_coarse != 0:
+            level = level_of(coarse, width)
+            step = cone.step * level_voxel(coarse, level)
             middle = position + direction * (0.5 * step)
-            if in_fine:
-                value = sample_volume(fine, level, middle, direction)
-            else:
-                value = sample_volume(coarse, level, middle, direction)
-                searching = inside_box(coarse, middle)
+            value = sample_volume(coarse, level, middle, direction)
+            # A wall on the border fades over one voxel to each side of it.
+            searching = inside_box(coarse, middle, level_voxel(coarse, level))
         else:
             searching = False
         if cone.split != DUAL:

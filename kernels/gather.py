@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from warp_dvct.kernels.cones import DUAL, SPLIT_WITH_BEFORE, ConeSettings, march_cone
+from warp_dvct.kernels.cones import DUAL, OPAQUE, ConeSettings, march_cone
 from warp_dvct.kernels.environment import Environment, environment_radiance
 from warp_dvct.kernels.gbuffer import BACKGROUND, SYNTHETIC, Points, load_surface
-from warp_dvct.kernels.geometry import FAR, Geometry, trace_real, trace_synthetic
+from warp_dvct.kernels.geometry import FAR, Geometry, occluded_by_real, occluded_by_synthetic, trace_real, trace_synthetic
 from warp_dvct.kernels.lights import ADDED, DOME, Lights, light_along_ray
 from warp_dvct.kernels.materials import (
     Surface,
@@ -134,27 +134,53 @@ def rgb(value: wp.vec4) -> wp.vec3:
 
 
 @wp.func
-def cone_incident(world: World, origin: wp.vec3, direction: wp.vec3, cone: ConeSettings, real: int) -> Incident:
-    """Light along a cone, before and after; what escapes reads the prefiltered environment.
+def close_cone(march: wp.vec4, open: int, sky: wp.vec3) -> wp.vec3:
+    """Radiosity of a whole cone from what its march covered.
+
+    Interpolation lets a cone's rim slip past the ends of walls. Where the cone's axis is blocked, the rest is taken to
+    look like the covered part; where it is open (or nobody asked), the rest is sky.
+    """
+    covered = wp.min(march[3], 1.0)
+    if open != 0:
+        return rgb(march) + sky * (1.0 - covered)
+    return rgb(march) / wp.max(covered, 1.0e-4)
+
+
+@wp.func
+def cone_incident(
+    world: World, geo: Geometry, s: Surface, direction: wp.vec3, cone: ConeSettings, with_before: int
+) -> Incident:
+    """Light along a cone, before and after.
 
     In the paper's form (``cone.split``), ``after - before`` at a real surface is the march through the delta field
-    alone; ``before`` is then 0 unless it was asked for by a second march.
+    alone; ``before`` is then 0 unless ``with_before`` asks for it by a second march.
     """
+    origin = s.position + s.normal_g * (cone.start * world.fine.voxel)
     march = march_cone(world.fine, world.coarse, world.has_coarse, origin, direction, cone)
-    free_after = wp.max(0.0, 1.0 - march.after[3])
+    sky_before = escaped(world, direction, cone.aperture, 0)
+    sky_after = escaped(world, direction, cone.aperture, 1)
+    open_before = int(1)
+    open_after = int(1)
+    if cone.escape != 0 and (march.before[3] < OPAQUE or march.after[3] < OPAQUE):
+        start = spawn_point(s, direction)
+        if occluded_by_real(geo, start, direction, FAR):
+            open_before = 0
+            open_after = 0
+        elif occluded_by_synthetic(geo, start, direction, FAR):
+            open_after = 0
     result = Incident()
-    if cone.split == DUAL or real == 0:
-        result.before = rgb(march.before) + escaped(world, direction, cone.aperture, 0) * wp.max(0.0, 1.0 - march.before[3])
-        result.after = rgb(march.after) + escaped(world, direction, cone.aperture, 1) * free_after
+    if cone.split == DUAL or s.synthetic != 0:
+        result.before = close_cone(march.before, open_before, sky_before)
+        result.after = close_cone(march.after, open_after, sky_after)
     else:
-        added = escaped(world, direction, cone.aperture, 1) - escaped(world, direction, cone.aperture, 0)
         result.before = wp.vec3(0.0, 0.0, 0.0)
-        if cone.split == SPLIT_WITH_BEFORE:
+        if with_before != 0:
             shaft = cone
             shaft.split = DUAL
             alone = march_cone(world.fine, world.coarse, world.has_coarse, origin, direction, shaft)
-            result.before = rgb(alone.before) + escaped(world, direction, cone.aperture, 0) * wp.max(0.0, 1.0 - alone.before[3])
-        result.after = result.before + rgb(march.before) + added * free_after
+            result.before = close_cone(alone.before, open_before, sky_before)
+        delta = close_cone(march.before, open_after, sky_after - sky_before)
+        result.after = result.before + delta
     return result
 
 
@@ -226,9 +252,11 @@ def _gather_cones(
     first: int,
     points: Points,
     index_in: wp.array(dtype=wp.int32),
+    geo: Geometry,
     world: World,
     cones: int,
     cone: ConeSettings,
+    with_before: int,
     seed: int,
     before_out: wp.array(dtype=wp.vec3),
     after_out: wp.array(dtype=wp.vec3),
@@ -246,7 +274,6 @@ def _gather_cones(
         if points.role[j] != BACKGROUND:
             s = load_surface(points, j)
             turn = 2.0 * PI * uniform1(seed, j, 0, 13)
-            origin = s.position + s.normal_g * (cone.start * world.fine.voxel)
             for k in range(cones):
                 sine2 = (float(k) + 0.5) / float(cones)
                 phi = 2.399963 * float(k) + turn
@@ -257,7 +284,7 @@ def _gather_cones(
                 if cone.aperture <= 0.0:
                     height = wp.min(0.5 / (float(cones) * wp.max(cos, 0.1)), 1.0)
                     shaft.aperture = 2.0 * wp.acos(1.0 - height)
-                light = cone_incident(world, origin, direction, shaft, wp.where(points.role[j] == SYNTHETIC, 0, 1))
+                light = cone_incident(world, geo, s, direction, shaft, with_before)
                 before += light.before
                 after += light.after
     before_out[i] = before / float(cones)
@@ -464,6 +491,7 @@ def _shade_specular_cones(
     first: int,
     points: Points,
     index_in: wp.array(dtype=wp.int32),
+    geo: Geometry,
     world: World,
     cone: ConeSettings,
     with_before: int,
@@ -483,8 +511,7 @@ def _shade_specular_cones(
     if wp.dot(direction, s.normal_g) > 0.0:
         shaft = cone
         shaft.aperture = wp.min(4.0 * wp.atan(s.alpha), 3.0)
-        origin = s.position + s.normal_g * (cone.start * world.fine.voxel)
-        light = cone_incident(world, origin, direction, shaft, 1 - s.synthetic)
+        light = cone_incident(world, geo, s, direction, shaft, with_before)
         weight = fresnel(s.f0, s.f90, wp.dot(s.normal, wo)) * INV_PI
         if s.synthetic != 0:
             light_out[j] += wp.cw_mul(weight, light.after)

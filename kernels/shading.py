@@ -168,8 +168,9 @@ def shadow_cone(
         area = lights.area[k] * wp.abs(wp.dot(axis, lights.direction[k]))
         radius = wp.max(lights.radius[k], wp.sqrt(area / PI))
         aperture = 2.0 * wp.atan2(radius, distance)
-        # The light's own voxels (a lamp's housing, the ceiling behind it) must not hide it.
-        shaft.reach = distance - 2.0 * fine.voxel
+        # Interpolation spreads what is behind the light (a ceiling) by one voxel of the last level in front of it.
+        slope = 2.0 * wp.tan(0.5 * aperture) * cone.detail
+        shaft.reach = (distance - 2.0 * fine.voxel) / (1.0 + 2.0 * slope)
     shaft.aperture = wp.max(aperture, 1.0e-3)
     origin = s.position + s.normal_g * (cone.start * fine.voxel)
     result = march_cone(fine, coarse, has_coarse, origin, axis, shaft)

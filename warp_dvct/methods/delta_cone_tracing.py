@@ -235,7 +235,7 @@ def _has_indirect(scene: Scene, plan: Plan) -> bool:
     return plan.settings.bounces > 0 or any(light.kind == LightKind.DOME for light in scene.lights)
 
 
-def _cone(plan: Plan, with_before: bool, aperture: float = 0.0) -> Any:
+def _cone(plan: Plan, aperture: float = 0.0) -> Any:
     settings = plan.settings
     cone = cones.ConeSettings()
     cone.aperture = aperture
@@ -243,7 +243,9 @@ def _cone(plan: Plan, with_before: bool, aperture: float = 0.0) -> Any:
     cone.start = settings.cones_start
     cone.reach = 4.0 * (plan.coarse.edge if plan.coarse else plan.fine.edge)
     cone.additive = int(settings.cones_coverage == "additive")
-    cone.split = 0 if settings.cones_delta == "dual" else (2 if with_before else 1)
+    cone.detail = settings.cones_detail
+    cone.escape = int(settings.cones_escape == "ray")
+    cone.split = cones.DUAL if settings.cones_delta == "dual" else cones.SPLIT
     return cone
 
 
@@ -266,8 +268,8 @@ def _shade_direct(
         direct.radius = 0.5 * float(np.linalg.norm(high - low)) * 1.001
     cone = None
     if settings.shadows == "cone":
-        cone = _cone(plan, part.with_before)
-        cone.split = 0  # a shadow needs both occupancies
+        cone = _cone(plan)
+        cone.split = cones.DUAL  # a shadow needs both occupancies
     shade_direct(
         launcher,
         device_scene,
@@ -288,13 +290,13 @@ def _irradiance(
     settings = plan.settings
     cone = None
     if settings.gather == "cones":
-        cone = _cone(plan, part.with_before, math.radians(settings.cones_aperture))
-    real = Gatherer(scene, world, settings.gather_rays, settings.seed, settings.cones_count, cone)
+        cone = _cone(plan, math.radians(settings.cones_aperture))
+    real = Gatherer(scene, world, settings.gather_rays, settings.seed, settings.cones_count, cone, part.with_before)
     if part.points is not buffer.points:
-        fewer = Gatherer(scene, world, max(1, settings.gather_rays // 4), settings.seed, settings.cones_count, cone)
+        fewer = Gatherer(scene, world, max(1, settings.gather_rays // 4), settings.seed, settings.cones_count, cone, part.with_before)
         return gather_all(launcher, part.points, part.count, fewer)
     pixel = point_pixels(launcher, buffer)
-    synthetic = Gatherer(scene, world, settings.gather_object_rays, settings.seed, settings.cones_count, cone)
+    synthetic = Gatherer(scene, world, settings.gather_object_rays, settings.seed, settings.cones_count, cone, part.with_before)
     before, after = gather_sparse(
         launcher,
         buffer,
@@ -325,7 +327,7 @@ def _shade_specular(launcher: Launcher, scene: DeviceScene, plan: Plan, world: A
     glossy.rays = settings.glossy_rays
     glossy.light_samples = settings.shadows_samples
     glossy.seed = settings.seed
-    cone = _cone(plan, part.with_before) if settings.glossy == "cones" else None
+    cone = _cone(plan) if settings.glossy == "cones" else None
     shade_specular(
         launcher,
         scene,

@@ -27,6 +27,7 @@ class Gatherer:
     seed: int
     cones: int = 0
     cone: Any = None
+    with_before: bool = True
 
     def run(self, launcher: Launcher, points: Any, index: Any, count: int) -> tuple[Any, Any]:
         """Irradiance [W m^-2] before and after at points ``index`` (-1 gives 0): two vec3 ``[count]``."""
@@ -43,7 +44,16 @@ class Gatherer:
             launcher.launch(
                 kernels._gather_cones,
                 count,
-                [points, index, self.world, self.cones, self.cone, self.seed],
+                [
+                    points,
+                    index,
+                    self.scene.geometry,
+                    self.world,
+                    self.cones,
+                    self.cone,
+                    int(self.with_before),
+                    self.seed,
+                ],
                 [before, after],
             )
         return before, after
@@ -151,7 +161,10 @@ def shade_specular(
         )
     else:
         launcher.launch(
-            kernels._shade_specular_cones, count, [points, index, world, cone, int(with_before)], [light, before]
+            kernels._shade_specular_cones,
+            count,
+            [points, index, scene.geometry, world, cone, int(with_before)],
+            [light, before],
         )
 
 
