@@ -11,7 +11,7 @@ import os
 import time
 import weakref
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any
 
@@ -59,9 +59,19 @@ class Launcher:
         if slab >= count:
             self._launch_slab(kernel, 0, count, inputs, outputs)
             return
-        starts = range(0, count, slab)
         assert self._pool is not None
-        list(self._pool.map(lambda a: self._launch_slab(kernel, a, min(slab, count - a), inputs, outputs), starts))
+        slabs = [
+            self._pool.submit(self._launch_slab, kernel, start, min(slab, count - start), inputs, outputs)
+            for start in range(0, count, slab)
+        ]
+        try:
+            for each in slabs:
+                each.result()
+        finally:
+            # After an interrupt the caller frees its arrays: no slab may still be writing to them.
+            for each in slabs:
+                each.cancel()
+            wait(slabs)
 
     def launch_serial(self, kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:
         """As :meth:`launch`, on one CPU thread: for kernels whose elements share a target."""

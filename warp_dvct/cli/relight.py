@@ -28,6 +28,22 @@ if TYPE_CHECKING:
 NOTICES_SHOWN = 20
 
 
+class Stops(click.ParamType):
+    """An exposure in stops; finite, and small enough that its power of two is."""
+
+    name = "stops"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Refuse what is no number in [-64, 64]."""
+        try:
+            stops = float(value)
+        except ValueError:
+            stops = float("nan")
+        if not abs(stops) <= 64.0:
+            self.fail(f"'{value}' is not a number between -64 and 64", param, ctx)
+        return stops
+
+
 @click.command()
 @click.argument("stage")
 @click.argument("output")
@@ -42,7 +58,7 @@ NOTICES_SHOWN = 20
 @click.option("--stats", metavar="FILE", help="Write seconds, memory, plan and notices as JSON.")
 @click.option(
     "--exposure",
-    type=float,
+    type=Stops(),
     default=0.0,
     show_default=True,
     metavar="STOPS",
@@ -66,12 +82,13 @@ def relight(
     stats: str | None,
     exposure: float,
     curve: str,
+    width: int | None,
     **options: Any,
 ) -> None:
     """Insert the synthetic objects of STAGE into its real scene; write OUTPUT.exr and a PNG preview beside it."""
     codes = _time_codes(output, frames)
     jobs = [_Job(code, *_paths(output, plate, code)) for code in codes]
-    for target in {Path(file).parent: file for job in jobs for file in (job.exr, job.png)}.values():
+    for target in {Path(job.exr).parent: job.exr for job in jobs}.values():
         check_writable(target)
     if stats:
         check_writable(stats)
@@ -79,7 +96,7 @@ def relight(
     if len(waiting) < len(jobs):
         click.echo(f"{len(jobs) - len(waiting)} of {len(jobs)} frames are there and are left out", err=True)
     if waiting:
-        Run(stage, options, exposure, curve).render(waiting, stats)
+        Run(stage, width, options, exposure, curve).render(waiting, stats)
 
 
 @dataclass(frozen=True)
@@ -127,14 +144,17 @@ class Run:
 
     Args:
         stage: File.
-        options: Keywords of ``Relighter``.
+        width: In pixels, or None for the plate's or the stage's.
+        options: Further keywords of ``Relighter``.
         exposure, curve: Of the preview.
     """
 
     stage: str
+    width: int | None
     options: dict[str, Any]
     exposure: float
     curve: str
+    height: int | None = None
     records: list[dict[str, Any]] = field(default_factory=list)
     noted: set[str] = field(default_factory=set)
 
@@ -144,10 +164,7 @@ class Run:
         from warp_dvct.launch import Launcher
         from warp_dvct.relighter import Relighter
 
-        width, height = self.options.pop("width"), None
-        if jobs[0].plate:  # read before the stage: a wrong file is found at once, and it decides the size
-            height, width, _ = read_plate(jobs[0].plate, width).shape
-        relighter = Relighter(self.stage, width=width, height=height, time=jobs[0].time, **self.options)
+        relighter = self._open(Relighter, jobs[0])
         preview = Launcher("cpu", self.options["threads"])
         for job in jobs:
             if job is not jobs[0]:
@@ -156,6 +173,17 @@ class Run:
             self._frame(relighter, preview, job)
         if stats:
             write_text(stats, json.dumps(self._statistics(relighter), indent=2) + "\n")
+
+    def _open(self, make: type[Relighter], job: _Job) -> Relighter:
+        """The plate decides the size: one that is named is read before the stage, so a wrong file is found at once."""
+        if job.plate:
+            self.height, self.width, _ = read_plate(job.plate, self.width).shape
+        relighter = make(self.stage, width=self.width, height=self.height, time=job.time, **self.options)
+        if relighter.scene.plate and not job.plate:
+            height, width, _ = read_plate(relighter.scene.plate, self.width).shape
+            if (width, height) != (relighter.width, relighter.height):
+                relighter = make(self.stage, width=width, height=height, time=job.time, **self.options)
+        return relighter
 
     def _frame(self, relighter: Relighter, preview: Launcher, job: _Job) -> None:
         from warp_dvct.passes.tonemap import tonemap
