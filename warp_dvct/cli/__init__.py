@@ -15,6 +15,7 @@ import click
 from warp_dvct.cli.plan import plan
 from warp_dvct.cli.relight import relight
 from warp_dvct.cli.scenes import scenes
+from warp_dvct.cli.settings import settings
 from warp_dvct.cli.warmup import warmup
 from warp_dvct.errors import DvctError
 
@@ -28,7 +29,7 @@ def cli() -> None:
     """Insert synthetic objects into real scenes with physically convincing light."""
 
 
-for command in (relight, plan, warmup, scenes):
+for command in (relight, plan, settings, scenes, warmup):
     cli.add_command(command)
 
 
