@@ -42,9 +42,9 @@ def room() -> Path:
 
 
 @pytest.fixture
-def moving_room(tmp_path, room) -> Path:
-    """The room with a ball that moves, a second camera and a mesh that asks for subdivision."""
-    stage = tmp_path / "moving.usda"
+def shot(tmp_path, room) -> Path:
+    """The room with a ball that moves and a mesh that asks for subdivision, which is not modelled."""
+    stage = tmp_path / "shot.usda"
     stage.write_text(
         f"""#usda 1.0
 (
@@ -55,12 +55,6 @@ def moving_room(tmp_path, room) -> Path:
 )
 over "World"
 {{
-    def Camera "Close" (
-        references = </World/Camera>
-    )
-    {{
-        float focalLength = 60
-    }}
     over "Synthetic"
     {{
         over "Ball"
@@ -71,6 +65,32 @@ over "World"
         {{
             uniform token subdivisionScheme = "catmullClark"
         }}
+    }}
+}}
+"""
+    )
+    return stage
+
+
+@pytest.fixture
+def moving_room(tmp_path, shot) -> Path:
+    """The shot with a second camera."""
+    stage = tmp_path / "moving.usda"
+    stage.write_text(
+        f"""#usda 1.0
+(
+    defaultPrim = "World"
+    metersPerUnit = 1
+    upAxis = "Y"
+    subLayers = [@{shot}@]
+)
+over "World"
+{{
+    def Camera "Close" (
+        references = </World/Camera>
+    )
+    {{
+        float focalLength = 60
     }}
 }}
 """
