@@ -9,7 +9,7 @@ import warp as wp
 from warp_dvct.kernels.gather import World, radiosity_at
 from warp_dvct.kernels.geometry import FAR, Geometry, Hit, corner_position, trace_real, trace_synthetic
 from warp_dvct.kernels.materials import Materials, Surface, hemispherical_albedo, spawn_point, surface_at
-from warp_dvct.kernels.sampling import cosine_hemisphere, from_frame, sobol2
+from warp_dvct.kernels.sampling import PI, cosine_hemisphere, from_frame, sobol2
 from warp_dvct.kernels.volume import Volume, brick_extent, face_of, face_weight, find_record, key_cell
 
 wp.set_module_options({"enable_backward": False})
@@ -207,6 +207,7 @@ def _link_patches(
     s.reach = patches.reach[i]
     before = wp.vec3(0.0, 0.0, 0.0)
     after = wp.vec3(0.0, 0.0, 0.0)
+    width = wp.sqrt(PI / float(rays))
     for k in range(rays):
         direction = from_frame(cosine_hemisphere(sobol2(seed, i, k, 23)), normal)
         origin = spawn_point(s, direction)
@@ -217,7 +218,7 @@ def _link_patches(
             n = world.normals[real.triangle]
             n = wp.where(wp.dot(n, direction) > 0.0, -n, n)
             position = origin + direction * real.t
-            light = radiosity_at(world, position, n)
+            light = radiosity_at(world, position, n, width * real.t)
             before += light.before
             link[0] = patch_at(volume, level, level_first, table_in, position, n)
             if synthetic.found == 0:
@@ -227,7 +228,7 @@ def _link_patches(
             n = world.normals[synthetic.triangle]
             n = wp.where(wp.dot(n, direction) > 0.0, -n, n)
             position = origin + direction * synthetic.t
-            light = radiosity_at(world, position, n)
+            light = radiosity_at(world, position, n, width * synthetic.t)
             after += light.after
             link[1] = patch_at(volume, level, level_first, table_in, position, n)
         link_out[i * rays + k] = link

@@ -22,6 +22,10 @@ from warp_dvct.kernels.volume import Volume, face_of, find_record
 wp.set_module_options({"enable_backward": False})
 
 
+FAINT = wp.constant(1.0e-6)  # coverage below which a voxel says nothing of a surface
+COARSE_FOOTPRINT = wp.constant(2.0)  # coarse voxels that a ray must cover before one of them may stand for it
+
+
 @wp.struct
 class World:
     """What gathered rays and cones read."""
@@ -80,20 +84,48 @@ def field_pair(volume: Volume, position: wp.vec3, normal: wp.vec3) -> FieldPair:
 
 @wp.func
 def ratio(value: wp.vec4) -> wp.vec3:
-    if value[3] <= 1.0e-6:
+    if value[3] <= FAINT:
         return wp.vec3(0.0, 0.0, 0.0)
     return wp.vec3(value[0], value[1], value[2]) / value[3]
 
 
 @wp.func
-def radiosity_at(world: World, position: wp.vec3, normal: wp.vec3) -> Incident:
-    """Radiosity of a surface point from the fine volume, or the coarse one where the fine one does not reach."""
-    fine = field_pair(world.fine, position, normal)
-    if world.has_coarse != 0 and fine.after[3] <= 1.0e-6:
-        fine = field_pair(world.coarse, position, normal)
+def voxel_pair(volume: Volume, position: wp.vec3, normal: wp.vec3) -> FieldPair:
+    """As ``field_pair``, from the one level-0 voxel that holds the point."""
+    local = (position - volume.low) / volume.voxel
+    total = FieldPair()
+    total.before = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    total.after = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    record = find_record(volume, 0, int(wp.floor(local[0])), int(wp.floor(local[1])), int(wp.floor(local[2])))
+    if record >= 0:
+        for axis in range(3):
+            share = wp.abs(normal[axis])
+            if share > 0.1:
+                at = record * 12 + 2 * face_of(axis, normal[axis])
+                total.before += share * volume.field[at]
+                total.after += share * volume.field[at + 1]
+    return total
+
+
+@wp.func
+def radiosity_at(world: World, position: wp.vec3, normal: wp.vec3, footprint: float) -> Incident:
+    """Radiosity of a surface point, averaged over about ``footprint``.
+
+    Wide rays read one voxel, of the coarse volume where that is fine enough; narrow ones interpolate the fine volume.
+    Where a volume holds no such surface the next one is asked.
+    """
+    pair = FieldPair()
+    if world.has_coarse != 0 and footprint > COARSE_FOOTPRINT * world.coarse.voxel:
+        pair = voxel_pair(world.coarse, position, normal)
+    elif footprint > world.fine.voxel:
+        pair = voxel_pair(world.fine, position, normal)
+    if pair.after[3] <= FAINT:
+        pair = field_pair(world.fine, position, normal)
+    if world.has_coarse != 0 and pair.after[3] <= FAINT:
+        pair = field_pair(world.coarse, position, normal)
     result = Incident()
-    result.before = ratio(fine.before)
-    result.after = ratio(fine.after)
+    result.before = ratio(pair.before)
+    result.after = ratio(pair.after)
     return result
 
 
@@ -105,17 +137,18 @@ def ray_incident(world: World, geo: Geometry, origin: wp.vec3, direction: wp.vec
     result.after = wp.vec3(0.0, 0.0, 0.0)
     real = trace_real(geo, origin, direction, FAR)
     synthetic = trace_synthetic(geo, origin, direction, real.t)
+    width = wp.sqrt(solid_angle)
     if real.found != 0:
         n = world.normals[real.triangle]
         n = wp.where(wp.dot(n, direction) > 0.0, -n, n)
-        result = radiosity_at(world, origin + direction * real.t, n)
+        result = radiosity_at(world, origin + direction * real.t, n, width * real.t)
     elif world.env.levels > 0:
         result.before = environment_radiance(world.env, direction, solid_angle, 0) * PI
         result.after = environment_radiance(world.env, direction, solid_angle, 1) * PI
     if synthetic.found != 0:
         n = world.normals[synthetic.triangle]
         n = wp.where(wp.dot(n, direction) > 0.0, -n, n)
-        inserted = radiosity_at(world, origin + direction * synthetic.t, n)
+        inserted = radiosity_at(world, origin + direction * synthetic.t, n, width * synthetic.t)
         result.after = inserted.after
     result.distance_before = real.t
     result.distance_after = synthetic.t

@@ -27,6 +27,7 @@ class Direct:
     """Settings of the pass."""
 
     samples: wp.int32  # per light
+    probes: wp.int32  # of these, traced before deciding whether the others have to be
     glossy: wp.int32  # rays of the specular pass per point; light samples share the highlights with them
     alpha_max: wp.float32  # roughest GGX alpha that the specular pass treats
     with_before: wp.int32  # 1: also the radiance before, on every real point (it becomes the plate)
@@ -84,6 +85,100 @@ def reflected(s: Surface, wo: wp.vec3, light: LightSample, direct: Direct) -> wp
     return wp.cw_mul(light.value, f)
 
 
+@wp.struct
+class Part:
+    """One light at one point: after on synthetic points, after - before on real ones; and before."""
+
+    light: wp.vec3
+    before: wp.vec3
+
+
+@wp.struct
+class Sight:
+    """What a shadow ray says: the light is seen in the real scene, and in the whole one (1 or 0)."""
+
+    before: wp.float32
+    after: wp.float32
+
+
+@wp.func
+def look(geo: Geometry, origin: wp.vec3, direction: wp.vec3, reach: float, need_before: int, shadowed: bool) -> Sight:
+    """Trace the objects first: where they do not shadow and nobody asks for 'before', both are equal."""
+    sight = Sight()
+    blocked = False
+    if shadowed:
+        blocked = occluded_by_synthetic(geo, origin, direction, reach)
+    sight.before = 1.0
+    if blocked or need_before != 0:
+        if occluded_by_real(geo, origin, direction, reach):
+            sight.before = 0.0
+    sight.after = wp.where(blocked, 0.0, sight.before)
+    return sight
+
+
+@wp.func
+def light_part(
+    points: Points,
+    i: int,
+    s: Surface,
+    wo: wp.vec3,
+    role: int,
+    geo: Geometry,
+    lights: Lights,
+    k: int,
+    direct: Direct,
+    added: bool,
+    shadowed: bool,
+) -> Part:
+    """One light by shadow rays. The first few decide: where they agree the light is wholly seen or hidden, and the rest
+    of the samples only integrate the unshadowed light; where they do not, all samples are traced."""
+    delta_only = role != SYNTHETIC and not added
+    need_before = int(1)
+    if delta_only and direct.with_before == 0:
+        need_before = 0
+    open = wp.vec3(0.0, 0.0, 0.0)
+    sum_before = wp.vec3(0.0, 0.0, 0.0)
+    sum_after = wp.vec3(0.0, 0.0, 0.0)
+    seen_before = float(0.0)
+    seen_after = float(0.0)
+    traced = int(0)
+    samples = int(direct.samples)
+    tracing = bool(True)
+    count = int(0)
+    while count < samples:
+        light = sample_light(lights, k, s.position, sobol2(direct.seed, i, count, 2 * k + 3))
+        f = reflected(s, wo, light, direct)
+        open += f
+        if tracing and wp.max(f[0], wp.max(f[1], f[2])) > 0.0:
+            sight = look(
+                geo, spawn_point(s, light.direction), light.direction, light.distance * SHADOW_END, need_before, shadowed
+            )
+            sum_before += f * sight.before
+            sum_after += f * sight.after
+            seen_before += sight.before
+            seen_after += sight.after
+            traced += 1
+        count += 1
+        if light.pdf <= 0.0:
+            samples = 1  # a light without extent: every sample is this one
+        elif tracing and count == direct.probes and traced > 0:
+            n = float(traced)
+            tracing = (seen_before > 0.0 and seen_before < n) or (seen_after > 0.0 and seen_after < n)
+    if not tracing:
+        # The probes agree: they stand for the samples that were not traced.
+        n = float(traced)
+        sum_before = open * (seen_before / n)
+        sum_after = open * (seen_after / n)
+    part = Part()
+    scale = 1.0 / float(samples)
+    if delta_only:
+        part.before = sum_before * scale
+        part.light = (sum_after - sum_before) * scale
+    else:
+        part.light = sum_after * scale
+    return part
+
+
 @wp.kernel
 def _shade_direct(
     first: int,
@@ -112,36 +207,9 @@ def _shade_direct(
             added = lights.role[k] == ADDED
             shadowed = may_shadow(lights, k, s.position, direct)
             if role == SYNTHETIC or added or direct.with_before != 0 or shadowed:
-                count = int(0)
-                part = wp.vec3(0.0, 0.0, 0.0)
-                part_before = wp.vec3(0.0, 0.0, 0.0)
-                while count < direct.samples:
-                    light = sample_light(lights, k, s.position, sobol2(direct.seed, i, count, 2 * k + 3))
-                    f = reflected(s, wo, light, direct)
-                    if wp.max(f[0], wp.max(f[1], f[2])) > 0.0:
-                        origin = spawn_point(s, light.direction)
-                        reach = light.distance * SHADOW_END
-                        if role == SYNTHETIC or added:
-                            if not occluded_by_synthetic(geo, origin, light.direction, reach):
-                                if not occluded_by_real(geo, origin, light.direction, reach):
-                                    part += f
-                        else:
-                            blocked = False
-                            if shadowed:
-                                blocked = occluded_by_synthetic(geo, origin, light.direction, reach)
-                            if blocked or direct.with_before != 0:
-                                if not occluded_by_real(geo, origin, light.direction, reach):
-                                    part_before += f
-                                    if blocked:
-                                        part -= f
-                    count += 1
-                    if light.pdf <= 0.0:
-                        # A light without extent: every sample is this one.
-                        part = part * float(direct.samples)
-                        part_before = part_before * float(direct.samples)
-                        count = direct.samples
-                total += part / float(direct.samples)
-                before += part_before / float(direct.samples)
+                part = light_part(points, i, s, wo, role, geo, lights, k, direct, added, shadowed)
+                total += part.light
+                before += part.before
     light_out[i] = total
     if direct.with_before != 0:
         before_out[i] = before

@@ -39,6 +39,10 @@ class Settings:
     shadows: str = _knob("ray", "how direct shadows are found", choices=("ray", "cone"))
     shadows_samples: int = _knob(16, "samples per light and shading point", low=1, high=4096)
 
+    shadows_probes: int = _knob(
+        10, "samples traced first; the others are traced only where these disagree", low=1, high=4096
+    )
+
     gather: str = _knob("rays", "how diffuse indirect light is gathered", choices=("rays", "cones"))
     gather_rays: int = _knob(64, "rays per gather point on real surfaces", low=1, high=65536)
     gather_stride: int = _knob(4, "pixels between gather points on real surfaces; 1 for every pixel", low=1, high=64)

@@ -255,6 +255,7 @@ def _shade_direct(
     settings = plan.settings
     direct = shading.Direct()
     direct.samples = settings.shadows_samples
+    direct.probes = min(settings.shadows_probes, settings.shadows_samples)
     direct.glossy = settings.glossy_rays if plan.glossy and settings.glossy == "rays" else 0
     direct.alpha_max = plan.alpha_max
     direct.with_before = int(part.with_before)
