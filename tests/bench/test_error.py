@@ -63,6 +63,18 @@ def test_delta_cones_is_measured_against_both_truths(cache, tmp_path):
     assert 40 < picture.mean() < 230
 
 
+@pytest.mark.parametrize("stage", module.LIT_STAGES)
+def test_balanced_is_close_to_the_truth_on_every_lit_stage(stage, cache, monkeypatch):
+    """FLIP at most .06 at equal bounces, far below both baselines; a small picture and a noisy truth only add."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    options = ErrorOptions(width=96, samples=64, bounces=4, cache=cache)
+    equal, many = (flips(block) for block in module.measure(stage, options).blocks)
+    assert equal["delta-cones balanced"] <= 0.06
+    assert many["delta-cones balanced"] <= 0.08
+    for values in (equal, many):
+        assert values["delta-cones balanced"] < 0.7 * min(values[PASTED], values[DIRECT])
+
+
 def test_plate_pixels_that_nothing_changes_have_no_error(cache):
     """The plate is the truth's own 'before': outside of the affected pixels the pasted object has next to no error."""
     report = measure("ground_dome", cache, quality="draft")
