@@ -16,7 +16,7 @@ help:
 	@echo 'make format  rewrite the sources in the house style'
 	@echo 'make clean   remove what the others made'
 
-# A stamp says what is installed; it is older than pyproject.toml when the dependencies may have changed.
+# A stamp says what is installed; pyproject.toml is newer when the dependencies may have changed.
 $(VENV)/bin/pip:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
 	  { echo 'Python 3.10 or newer is needed; name one with: make PYTHON=python3.12'; exit 1; }
@@ -38,6 +38,7 @@ $(VENV)/.dev-installed: pyproject.toml | $(VENV)/bin/pip
 
 demo: $(VENV)/.run-installed
 	@mkdir -p out
+	@echo 'Relighting $(STAGE); the first run also compiles the kernels, for about half a minute.'
 	@$(BIN)/warp-dvct relight "$$($(BIN)/warp-dvct scenes $(STAGE))" out/demo.exr
 	@echo 'The picture is $(CURDIR)/out/demo.png; all its layers are in $(CURDIR)/out/demo.exr'
 
