@@ -6,6 +6,7 @@ further bounce only follows the links from patch to patch.
 
 import warp as wp
 
+from warp_dvct.kernels.bounce_field import BounceField, bounced_irradiance
 from warp_dvct.kernels.gather import World, radiosity_at
 from warp_dvct.kernels.geometry import FAR, Geometry, Hit, corner_position, trace_real, trace_synthetic
 from warp_dvct.kernels.materials import Materials, Surface, hemispherical_albedo, spawn_point, surface_at
@@ -272,51 +273,18 @@ def _reinject(
     target: Volume,
     area_in: wp.array(dtype=wp.vec2),
     albedo_in: wp.array(dtype=wp.vec3),
-    volume: Volume,
-    level: int,
-    level_first: int,
-    table_in: wp.array(dtype=wp.int32),
-    patches: Patches,
-    total_in: wp.array(dtype=wp.vec3),
+    field: BounceField,
     flux_out: wp.array(dtype=wp.vec3),
 ):
-    """Add the bounces to a record's faces: patches of the same face around it, trilinear over the patches' level."""
+    """Add what a record's faces reflect of the bounces."""
     i = first + wp.tid()
     cell = key_cell(key_in[i], brick_extent(target.n, 0))
     center = wp.vec3(float(cell[0]) + 0.5, float(cell[1]) + 0.5, float(cell[2]) + 0.5) * target.voxel + target.low
-    local = (center - volume.low) / (volume.voxel * float(1 << level)) - wp.vec3(0.5, 0.5, 0.5)
-    x0 = int(wp.floor(local[0]))
-    y0 = int(wp.floor(local[1]))
-    z0 = int(wp.floor(local[2]))
     for face in range(6):
         area = area_in[i * 6 + face]
         if area[1] > 0.0:
-            before = wp.vec3(0.0, 0.0, 0.0)
-            after = wp.vec3(0.0, 0.0, 0.0)
-            weight_before = float(0.0)
-            weight_after = float(0.0)
-            for corner in range(8):
-                dx = corner & 1
-                dy = (corner >> 1) & 1
-                dz = corner >> 2
-                record = find_record(volume, level, x0 + dx, y0 + dy, z0 + dz)
-                if record >= 0:
-                    patch = table_in[(record - level_first) * 6 + face]
-                    if patch >= 0:
-                        fx = local[0] - float(x0)
-                        fy = local[1] - float(y0)
-                        fz = local[2] - float(z0)
-                        weight = (
-                            wp.where(dx == 1, fx, 1.0 - fx)
-                            * wp.where(dy == 1, fy, 1.0 - fy)
-                            * wp.where(dz == 1, fz, 1.0 - fz)
-                        ) + 1.0e-4
-                        after += total_in[2 * patch + 1] * weight
-                        weight_after += weight
-                        if patches.real[patch] != 0:
-                            before += total_in[2 * patch] * weight
-                            weight_before += weight
-            if weight_before > 0.0:
-                flux_out[(i * 6 + face) * 2] += wp.cw_mul(albedo_in[2 * i], before) * (area[0] / weight_before)
-            if weight_after > 0.0:
-                flux_out[(i * 6 + face) * 2 + 1] += wp.cw_mul(albedo_in[2 * i + 1], after) * (area[1] / weight_after)
+            axis = wp.vec3(0.0, 0.0, 0.0)
+            axis[face / 2] = wp.where((face & 1) == 0, 1.0, -1.0)
+            light = bounced_irradiance(field, center, axis)
+            flux_out[(i * 6 + face) * 2] += wp.cw_mul(albedo_in[2 * i], light.before) * area[0]
+            flux_out[(i * 6 + face) * 2 + 1] += wp.cw_mul(albedo_in[2 * i + 1], light.after) * area[1]

@@ -65,7 +65,9 @@ def sample_volume(volume: Volume, level: int, position: wp.vec3, direction: wp.v
                 wx * volume.field[at + face_x] + wy * volume.field[at + face_y] + wz * volume.field[at + face_z]
             )
             result.after += weight * (
-                wx * volume.field[at + face_x + 1] + wy * volume.field[at + face_y + 1] + wz * volume.field[at + face_z + 1]
+                wx * volume.field[at + face_x + 1]
+                + wy * volume.field[at + face_y + 1]
+                + wz * volume.field[at + face_z + 1]
             )
     return result
 
@@ -91,7 +93,9 @@ def accumulate(total: wp.vec4, value: wp.vec4, step: float, additive: int) -> wp
 def inside_box(volume: Volume, position: wp.vec3, margin: float) -> bool:
     edge = volume.voxel * float(volume.n) + margin
     local = position - volume.low
-    return wp.min(local[0], wp.min(local[1], local[2])) >= -margin and wp.max(local[0], wp.max(local[1], local[2])) <= edge
+    return (
+        wp.min(local[0], wp.min(local[1], local[2])) >= -margin and wp.max(local[0], wp.max(local[1], local[2])) <= edge
+    )
 
 
 @wp.func

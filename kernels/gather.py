@@ -5,18 +5,21 @@ import warp as wp
 from warp_dvct.kernels.cones import DUAL, OPAQUE, ConeSettings, march_cone
 from warp_dvct.kernels.environment import Environment, environment_radiance
 from warp_dvct.kernels.gbuffer import BACKGROUND, SYNTHETIC, Points, load_surface
-from warp_dvct.kernels.geometry import FAR, Geometry, occluded_by_real, occluded_by_synthetic, trace_real, trace_synthetic
-from warp_dvct.kernels.lights import ADDED, DOME, Lights, light_along_ray
+from warp_dvct.kernels.geometry import (
+    FAR,
+    Geometry,
+    occluded_by_real,
+    occluded_by_synthetic,
+    trace_real,
+    trace_synthetic,
+)
 from warp_dvct.kernels.materials import (
     Surface,
-    brdf_cos_specular,
     fresnel,
-    ggx_sample_half,
     hemispherical_albedo_specular,
     spawn_point,
 )
-from warp_dvct.kernels.sampling import INV_PI, PI, cosine_hemisphere, from_frame, sobol2, tangent_of, uniform1
-from warp_dvct.kernels.shading import vndf_pdf
+from warp_dvct.kernels.sampling import INV_PI, PI, cosine_hemisphere, from_frame, sobol2, uniform1
 from warp_dvct.kernels.volume import Volume, face_of, find_record
 
 wp.set_module_options({"enable_backward": False})
@@ -379,7 +382,9 @@ def _reconstruct(
                     facing = wp.dot(normal, points.normal[j])
                     if facing > 0.0:
                         offset = points.position[j] - position
-                        gap = wp.max(wp.abs(wp.dot(offset, normal_g)), wp.abs(wp.dot(offset, points.normal_g[j]))) / reach
+                        gap = (
+                            wp.max(wp.abs(wp.dot(offset, normal_g)), wp.abs(wp.dot(offset, points.normal_g[j]))) / reach
+                        )
                         dx = (float(j % width) + 0.5 - px) / stride
                         dy = (float(j / width) + 0.5 - py) / stride
                         width2 = float(guide.radius) + 0.5
@@ -450,110 +455,6 @@ def _shade_indirect(
                 radiance_before_out[i] += wp.cw_mul(reflectance, before_in[i])
 
 
-@wp.struct
-class Glossy:
-    """Settings of the specular pass."""
-
-    rays: wp.int32
-    light_samples: wp.int32  # of the direct pass, which shares the highlights
-    seed: wp.int32
-
-
-@wp.func
-def lights_along(
-    lights: Lights, s: Surface, wo: wp.vec3, origin: wp.vec3, direction: wp.vec3, reach: float, glossy: Glossy, with_added: int
-) -> wp.vec3:
-    """Finite lights that a reflected ray meets, with the power-heuristic share that the direct pass left."""
-    total = wp.vec3(0.0, 0.0, 0.0)
-    b = float(glossy.rays) * vndf_pdf(s, wo, direction)
-    for k in range(lights.count):
-        if lights.kind[k] != DOME and (lights.role[k] != ADDED or with_added != 0):
-            met = light_along_ray(lights, k, origin, direction)
-            if met.pdf > 0.0 and met.distance < reach:
-                a = float(glossy.light_samples) * met.pdf
-                total += met.radiance * (b * b / (a * a + b * b))
-    return total
-
-
-@wp.kernel
-def _shade_specular_rays(
-    first: int,
-    points: Points,
-    index_in: wp.array(dtype=wp.int32),
-    geo: Geometry,
-    world: World,
-    lights: Lights,
-    glossy: Glossy,
-    with_before: int,
-    light_out: wp.array(dtype=wp.vec3),
-    before_out: wp.array(dtype=wp.vec3),
-):
-    """Add the GGX lobe's reflections by exact rays with visible-normal sampling (eq. 6's second term)."""
-    i = first + wp.tid()
-    j = index_in[i]
-    s = load_surface(points, j)
-    wo = points.view[j]
-    t = tangent_of(s.normal)
-    b = wp.cross(s.normal, t)
-    local = wp.vec3(wp.dot(wo, t), wp.dot(wo, b), wp.dot(wo, s.normal))
-    before = wp.vec3(0.0, 0.0, 0.0)
-    after = wp.vec3(0.0, 0.0, 0.0)
-    for k in range(glossy.rays):
-        h = ggx_sample_half(local, s.alpha, sobol2(glossy.seed, j, k, 17))
-        half = t * h[0] + b * h[1] + s.normal * h[2]
-        direction = wp.normalize(half * (2.0 * wp.dot(wo, half)) - wo)
-        pdf = vndf_pdf(s, wo, direction)
-        if wp.dot(direction, s.normal_g) > 0.0 and pdf > 0.0:
-            weight = brdf_cos_specular(s, wo, direction) / pdf
-            origin = spawn_point(s, direction)
-            light = ray_incident(world, geo, origin, direction, 1.0 / (pdf * float(glossy.rays)))
-            lamps = lights_along(lights, s, wo, origin, direction, light.distance_after, glossy, 1)
-            after += wp.cw_mul(weight, light.after * INV_PI + lamps)
-            if s.synthetic == 0:
-                lamps = lights_along(lights, s, wo, origin, direction, light.distance_before, glossy, 0)
-                before += wp.cw_mul(weight, light.before * INV_PI + lamps)
-    after = after / float(glossy.rays)
-    before = before / float(glossy.rays)
-    light_out[j] += after - before
-    if with_before != 0:
-        before_out[j] += before
-
-
-@wp.kernel
-def _shade_specular_cones(
-    first: int,
-    points: Points,
-    index_in: wp.array(dtype=wp.int32),
-    geo: Geometry,
-    world: World,
-    cone: ConeSettings,
-    with_before: int,
-    light_out: wp.array(dtype=wp.vec3),
-    before_out: wp.array(dtype=wp.vec3),
-):
-    """Add the GGX lobe's reflections by one cone around the mirror direction, as wide as the lobe (eq. 6).
-
-    The cone's half angle holds half of the lobe: tan = alpha for normals (GGX's median slope is alpha), doubled by the
-    reflection.
-    """
-    i = first + wp.tid()
-    j = index_in[i]
-    s = load_surface(points, j)
-    wo = points.view[j]
-    direction = wp.normalize(s.normal * (2.0 * wp.dot(s.normal, wo)) - wo)
-    if wp.dot(direction, s.normal_g) > 0.0:
-        shaft = cone
-        shaft.aperture = wp.min(4.0 * wp.atan(s.alpha), 3.0)
-        light = cone_incident(world, geo, s, direction, shaft, with_before)
-        weight = fresnel(s.f0, s.f90, wp.dot(s.normal, wo)) * INV_PI
-        if s.synthetic != 0:
-            light_out[j] += wp.cw_mul(weight, light.after)
-        else:
-            light_out[j] += wp.cw_mul(weight, light.after - light.before)
-            if with_before != 0:
-                before_out[j] += wp.cw_mul(weight, light.before)
-
-
 @wp.kernel
 def _point_pixels(
     first: int, edge_pixel_in: wp.array(dtype=wp.int32), pixels: int, samples: int, pixel_out: wp.array(dtype=wp.int32)
@@ -584,10 +485,3 @@ def _merge(
     i = first + wp.tid()
     before_out[i] += before_in[i]
     after_out[i] += after_in[i]
-
-@wp.kernel
-def _mark_glossy(first: int, points: Points, alpha_max: float, flag_out: wp.array(dtype=wp.int32)):
-    """1 where a point has a specular lobe that the specular pass treats."""
-    i = first + wp.tid()
-    glossy = points.role[i] != BACKGROUND and points.lobe[i][0] > 0.0 and points.lobe[i][1] <= alpha_max
-    flag_out[i] = wp.where(glossy, 1, 0)

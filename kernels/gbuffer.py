@@ -78,7 +78,15 @@ def store_hit(
 
 @wp.func
 def see(
-    geo: Geometry, mats: Materials, cam: CameraFrame, px: float, py: float, width: int, height: int, i: int, points: Points
+    geo: Geometry,
+    mats: Materials,
+    cam: CameraFrame,
+    px: float,
+    py: float,
+    width: int,
+    height: int,
+    i: int,
+    points: Points,
 ):
     ray = camera_ray(cam, px, py, width, height)
     hit = trace_all(geo, ray.origin, ray.direction, ray.t_max)

@@ -100,7 +100,9 @@ def _filter_level(
         total = wp.vec4(0.0, 0.0, 0.0, 0.0)
         if mode == ISOTROPIC:
             for child in range(8):
-                total += child_value(volume, below, x + (child & 1), y + ((child >> 1) & 1), z + (child >> 2), slot) * 0.125
+                total += (
+                    child_value(volume, below, x + (child & 1), y + ((child >> 1) & 1), z + (child >> 2), slot) * 0.125
+                )
         else:
             near = wp.where((face & 1) == 0, 1, 0)
             for pair in range(4):

@@ -120,7 +120,9 @@ def emit_parallel(lights: Lights, i: int, target: Target, texel: wp.vec2, xi: wp
             beam.flux = lights.radiance[i] * (TWO_PI * cap)
     disc = concentric_disk(texel) * target.radius
     beam.flux = beam.flux * (PI * target.radius * target.radius)
-    beam.origin = target.center + from_frame(wp.vec3(disc[0], disc[1], 0.0), beam.direction) - beam.direction * target.start
+    beam.origin = (
+        target.center + from_frame(wp.vec3(disc[0], disc[1], 0.0), beam.direction) - beam.direction * target.start
+    )
     return beam
 
 

@@ -151,7 +151,12 @@ def light_part(
         open += f
         if tracing and wp.max(f[0], wp.max(f[1], f[2])) > 0.0:
             sight = look(
-                geo, spawn_point(s, light.direction), light.direction, light.distance * SHADOW_END, need_before, shadowed
+                geo,
+                spawn_point(s, light.direction),
+                light.direction,
+                light.distance * SHADOW_END,
+                need_before,
+                shadowed,
             )
             sum_before += f * sight.before
             sum_after += f * sight.after

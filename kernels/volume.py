@@ -75,7 +75,12 @@ def inside_volume(volume: Volume, position: wp.vec3) -> bool:
     local = position - volume.low
     edge = volume.voxel * float(volume.n)
     return (
-        local[0] >= 0.0 and local[1] >= 0.0 and local[2] >= 0.0 and local[0] < edge and local[1] < edge and local[2] < edge
+        local[0] >= 0.0
+        and local[1] >= 0.0
+        and local[2] >= 0.0
+        and local[0] < edge
+        and local[1] < edge
+        and local[2] < edge
     )
 
 

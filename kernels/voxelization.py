@@ -51,14 +51,20 @@ def load_triangle(corners_in: wp.array(dtype=wp.vec3), index: int, low: wp.vec3,
 def edge_reaches(p: wp.vec2, q: wp.vec2, side: float, low: wp.vec2, size: float) -> bool:
     """Whether the square at ``low`` is not wholly outside of the edge p -> q of a triangle wound by ``side``."""
     normal = wp.vec2(p[1] - q[1], q[0] - p[0]) * side
-    farthest = wp.vec2(wp.where(normal[0] > 0.0, low[0] + size, low[0]), wp.where(normal[1] > 0.0, low[1] + size, low[1]))
+    farthest = wp.vec2(
+        wp.where(normal[0] > 0.0, low[0] + size, low[0]), wp.where(normal[1] > 0.0, low[1] + size, low[1])
+    )
     return wp.dot(normal, farthest - p) >= 0.0
 
 
 @wp.func
 def projection_overlaps(a: wp.vec2, b: wp.vec2, c: wp.vec2, area: float, low: wp.vec2, size: float) -> bool:
     side = wp.where(area >= 0.0, 1.0, -1.0)
-    return edge_reaches(a, b, side, low, size) and edge_reaches(b, c, side, low, size) and edge_reaches(c, a, side, low, size)
+    return (
+        edge_reaches(a, b, side, low, size)
+        and edge_reaches(b, c, side, low, size)
+        and edge_reaches(c, a, side, low, size)
+    )
 
 
 @wp.func
@@ -178,7 +184,9 @@ def _count_tiles(
     if not outside:
         for z in range(first_index(triangle.low[2] / 8.0, tiles), first_index(triangle.high[2] / 8.0, tiles) + 1):
             for y in range(first_index(triangle.low[1] / 8.0, tiles), first_index(triangle.high[1] / 8.0, tiles) + 1):
-                for x in range(first_index(triangle.low[0] / 8.0, tiles), first_index(triangle.high[0] / 8.0, tiles) + 1):
+                for x in range(
+                    first_index(triangle.low[0] / 8.0, tiles), first_index(triangle.high[0] / 8.0, tiles) + 1
+                ):
                     if overlaps(triangle, wp.vec3(float(x), float(y), float(z)) * 8.0, 8.0):
                         count += 1
     count_out[i] = count
@@ -234,9 +242,17 @@ def _count_fragments(
     triangle = load_triangle(corners_in, tile_triangle_in[i], low, voxel)
     start = tile_cell(tile_in[i], brick_extent(n, 0))
     count = int(0)
-    for z in range(wp.max(start[2], first_index(triangle.low[2], n)), wp.min(start[2] + 7, first_index(triangle.high[2], n)) + 1):
-        for y in range(wp.max(start[1], first_index(triangle.low[1], n)), wp.min(start[1] + 7, first_index(triangle.high[1], n)) + 1):
-            for x in range(wp.max(start[0], first_index(triangle.low[0], n)), wp.min(start[0] + 7, first_index(triangle.high[0], n)) + 1):
+    for z in range(
+        wp.max(start[2], first_index(triangle.low[2], n)), wp.min(start[2] + 7, first_index(triangle.high[2], n)) + 1
+    ):
+        for y in range(
+            wp.max(start[1], first_index(triangle.low[1], n)),
+            wp.min(start[1] + 7, first_index(triangle.high[1], n)) + 1,
+        ):
+            for x in range(
+                wp.max(start[0], first_index(triangle.low[0], n)),
+                wp.min(start[0] + 7, first_index(triangle.high[0], n)) + 1,
+            ):
                 if overlaps(triangle, wp.vec3(float(x), float(y), float(z)), 1.0):
                     count += 1
     count_out[i] = count
@@ -267,9 +283,17 @@ def _cut_fragments(
     triangle = load_triangle(corners_in, index, low, voxel)
     bricks = brick_extent(n, 0)
     start = tile_cell(tile_in[i], bricks)
-    for z in range(wp.max(start[2], first_index(triangle.low[2], n)), wp.min(start[2] + 7, first_index(triangle.high[2], n)) + 1):
-        for y in range(wp.max(start[1], first_index(triangle.low[1], n)), wp.min(start[1] + 7, first_index(triangle.high[1], n)) + 1):
-            for x in range(wp.max(start[0], first_index(triangle.low[0], n)), wp.min(start[0] + 7, first_index(triangle.high[0], n)) + 1):
+    for z in range(
+        wp.max(start[2], first_index(triangle.low[2], n)), wp.min(start[2] + 7, first_index(triangle.high[2], n)) + 1
+    ):
+        for y in range(
+            wp.max(start[1], first_index(triangle.low[1], n)),
+            wp.min(start[1] + 7, first_index(triangle.high[1], n)) + 1,
+        ):
+            for x in range(
+                wp.max(start[0], first_index(triangle.low[0], n)),
+                wp.min(start[0] + 7, first_index(triangle.high[0], n)) + 1,
+            ):
                 corner = wp.vec3(float(x), float(y), float(z))
                 if overlaps(triangle, corner, 1.0):
                     moments = polygon_moments(cut_triangle(triangle, corner))
@@ -291,9 +315,7 @@ def _cut_fragments(
 
 
 @wp.kernel
-def _mark_starts(
-    first: int, key_in: wp.array(dtype=wp.int32), shift: int, start_out: wp.array(dtype=wp.int32)
-):
+def _mark_starts(first: int, key_in: wp.array(dtype=wp.int32), shift: int, start_out: wp.array(dtype=wp.int32)):
     """1 where a sorted key, less its ``shift`` lowest bits, differs from the one before it; 0 for EMPTY_KEY."""
     i = first + wp.tid()
     key = key_in[i]
@@ -333,7 +355,11 @@ def _parent_keys(first: int, key_in: wp.array(dtype=wp.int32), n: int, level: in
 
 @wp.kernel
 def _fill_table(
-    first: int, brick_in: wp.array(dtype=wp.int32), table_start: int, brick_start: int, tables_out: wp.array(dtype=wp.int32)
+    first: int,
+    brick_in: wp.array(dtype=wp.int32),
+    table_start: int,
+    brick_start: int,
+    tables_out: wp.array(dtype=wp.int32),
 ):
     i = first + wp.tid()
     tables_out[table_start + brick_in[i]] = brick_start + i
@@ -388,7 +414,6 @@ def _sum_areas(
             else:
                 real += shown * fragment_in[fragment][3]
         area_out[i * 6 + face] = wp.vec2(real, real + synthetic)
-
 
 
 @wp.kernel

@@ -314,7 +314,11 @@ def _passes(
             if lit and glossy
             else "no material has a specular lobe smoother than glossy.roughness",
         ),
-        PassPlan("before", not has_plate, "no plate: the real scene is rendered as one" if not has_plate else "a plate is given"),
+        PassPlan(
+            "before",
+            not has_plate,
+            "no plate: the real scene is rendered as one" if not has_plate else "a plate is given",
+        ),
         PassPlan("composite", True, "layers and the finished picture", pixels * 100),
     ]
     return tuple(passes)

@@ -165,9 +165,7 @@ class Relighter:
         if self._kept is None or self._kept[0] != key:
             with self._launcher.scope("upload"):
                 self._kept = None  # free the old one first
-                uploaded = DeviceScene.upload(
-                    self._launcher, self.scene, np.asarray(self.plan.origin), self.plan.scale
-                )
+                uploaded = DeviceScene.upload(self._launcher, self.scene, np.asarray(self.plan.origin), self.plan.scale)
             self._kept = (key, uploaded, None)
         device_scene = self._kept[1]
         frame = camera_frame(self.scene.camera, np.asarray(self.plan.origin), self.plan.scale)
@@ -235,5 +233,3 @@ def relight(stage: Any, *, plate: np.ndarray | None = None, **options: Any) -> L
         options: As for :class:`Relighter`.
     """
     return Relighter(stage, **options).render(plate)
-
-

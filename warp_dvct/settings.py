@@ -16,7 +16,9 @@ from warp_dvct.errors import OptionError
 QUALITIES = ("draft", "balanced", "high")
 
 
-def _knob(default: Any, help: str, *, low: float = -math.inf, high: float = math.inf, choices: tuple[str, ...] = ()) -> Any:
+def _knob(
+    default: Any, help: str, *, low: float = -math.inf, high: float = math.inf, choices: tuple[str, ...] = ()
+) -> Any:
     return field(default=default, metadata={"help": help, "low": low, "high": high, "choices": choices})
 
 
@@ -29,7 +31,9 @@ class Settings:
     antialias: int = _knob(4, "shading points per edge pixel; 0 for none", low=0, high=64)
 
     volume_resolution: int = _knob(256, "voxels an edge of the fine volume", low=1, high=1024)
-    volume_scale: float = _knob(2.0, "edge of the fine volume over the synthetic bounding box's largest", low=1.0, high=1e3)
+    volume_scale: float = _knob(
+        2.0, "edge of the fine volume over the synthetic bounding box's largest", low=1.0, high=1e3
+    )
     volume_coarse: int = _knob(128, "voxels an edge of the volume around the fine one; 0 for none", low=0, high=1024)
     volume_reach: float = _knob(16.0, "largest edge of the coarse volume, in edges of the fine one", low=1.0, high=1e4)
 
@@ -51,7 +55,9 @@ class Settings:
     gather_radius: int = _knob(2, "gather points to each side that reconstruction looks at", low=0, high=16)
 
     cones_count: int = _knob(9, "diffuse cones", low=4, high=36)
-    cones_aperture: float = _knob(0.0, "full opening angle of a diffuse cone [degrees]; 0 by count", low=0.0, high=179.0)
+    cones_aperture: float = _knob(
+        0.0, "full opening angle of a diffuse cone [degrees]; 0 by count", low=0.0, high=179.0
+    )
     cones_step: float = _knob(1.0, "march step in voxels of the current level", low=0.05, high=8.0)
     cones_detail: float = _knob(0.5, "voxel edge over the cone's diameter", low=0.02, high=4.0)
     cones_start: float = _knob(1.5, "height above the surface at which a march starts [voxels]", low=0.0, high=64.0)

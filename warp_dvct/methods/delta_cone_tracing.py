@@ -16,21 +16,19 @@ import numpy as np
 import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
-from warp_dvct.kernels import cones, gather, shading
+from warp_dvct.kernels import cones, gather, shading, specular
 from warp_dvct.kernels.volume import Volume
 from warp_dvct.launch import Launcher
 from warp_dvct.layers import Radiance
-from warp_dvct.passes.bounces import choose_patches, mean_albedo, reinject, solve_bounces
+from warp_dvct.passes.bounces import bounce_field, choose_patches, mean_albedo, reinject, solve_bounces
 from warp_dvct.passes.environment import build_environment
 from warp_dvct.passes.gather import (
     Gatherer,
-    find_glossy,
     gather_all,
     gather_sparse,
     merge,
     point_pixels,
     shade_indirect,
-    shade_specular,
 )
 from warp_dvct.passes.gbuffer import GBuffer, render_gbuffer
 from warp_dvct.passes.injection import empty_flux, inject
@@ -38,6 +36,7 @@ from warp_dvct.passes.pyramid import build_pyramid, light_faces
 from warp_dvct.passes.resolve import resolve
 from warp_dvct.passes.rsm import render_rsm
 from warp_dvct.passes.shading import shade_direct
+from warp_dvct.passes.specular import find_glossy, shade_specular
 from warp_dvct.passes.voxels import Box, Voxels, voxelize
 from warp_dvct.plan import Plan
 from warp_dvct.scene import LightKind, Role, Scene
@@ -50,10 +49,12 @@ class LightField:
     Attributes:
         world: ``kernels.gather.World``, as gathering kernels take it.
         volumes: The voxels behind it, fine first; empty where the plan needs none.
+        bounces: ``BounceField``, the irradiance of second and further bounces.
     """
 
     world: Any
     volumes: tuple[Voxels, ...]
+    bounces: Any
 
 
 def light_volumes(launcher: Launcher, scene: Scene, device_scene: DeviceScene, plan: Plan) -> LightField:
@@ -67,24 +68,31 @@ def light_volumes(launcher: Launcher, scene: Scene, device_scene: DeviceScene, p
             volumes = [_voxelize(launcher, device_scene, normals, b) for b in (plan.fine, plan.coarse) if b]
     world = _world(launcher, scene, normals, volumes)
     if not volumes or settings.bounces == 0:
-        return LightField(world, tuple(volumes))
+        return LightField(world, tuple(volumes), bounce_field(launcher, None))
     fluxes = [empty_flux(launcher, v) for v in volumes]
     for voxels, flux in zip(volumes, fluxes, strict=True):
         _inject_lights(launcher, device_scene, plan, voxels, flux)
         with launcher.scope("light faces"):
             light_faces(launcher, voxels, flux, filter=settings.cones_filter)
+    bounces = bounce_field(launcher, None)
     if settings.bounces > 1:
         with launcher.scope("bounces"):
-            _bounce(launcher, device_scene, normals, world, volumes, fluxes, plan)
+            bounces = _bounce(launcher, device_scene, normals, world, volumes, fluxes, plan)
     if needed["pyramid"]:
         with launcher.scope("pyramid"):
             for voxels in volumes:
                 build_pyramid(launcher, voxels, filter=settings.cones_filter)
-    return LightField(world, tuple(volumes))
+    return LightField(world, tuple(volumes), bounces)
 
 
 def render(
-    launcher: Launcher, scene: Scene, device_scene: DeviceScene, light_field: LightField, plan: Plan, *, with_before: bool
+    launcher: Launcher,
+    scene: Scene,
+    device_scene: DeviceScene,
+    light_field: LightField,
+    plan: Plan,
+    *,
+    with_before: bool,
 ) -> Radiance:
     """Shade what the camera sees (Franke 2014, section 3.3): direct, indirect diffuse, indirect specular, resolve.
 
@@ -128,7 +136,7 @@ def render(
                     )
             if plan.glossy:
                 with launcher.scope("specular"):
-                    _shade_specular(launcher, device_scene, plan, world, part)
+                    _shade_specular(launcher, device_scene, plan, light_field, part)
     with launcher.scope("resolve"):
         return resolve(
             launcher,
@@ -213,7 +221,7 @@ def _bounce(
     volumes: list[Voxels],
     fluxes: list[Any],
     plan: Plan,
-) -> None:
+) -> Any:
     settings = plan.settings
     patches = choose_patches(launcher, scene, volumes[-1], normals, settings.patches_count)
     total = solve_bounces(
@@ -225,10 +233,12 @@ def _bounce(
         rays=settings.patches_rays,
         seed=settings.seed,
     )
+    field = bounce_field(launcher, patches, total)
     for voxels, flux in zip(volumes, fluxes, strict=True):
         albedo = mean_albedo(launcher, scene, voxels, normals)
-        reinject(launcher, voxels, albedo, flux, patches, total)
+        reinject(launcher, voxels, albedo, flux, field)
         light_faces(launcher, voxels, flux, filter=settings.cones_filter)
+    return field
 
 
 def _has_indirect(scene: Scene, plan: Plan) -> bool:
@@ -294,10 +304,14 @@ def _irradiance(
         cone = _cone(plan, math.radians(settings.cones_aperture))
     real = Gatherer(scene, world, settings.gather_rays, settings.seed, settings.cones_count, cone, part.with_before)
     if part.points is not buffer.points:
-        fewer = Gatherer(scene, world, max(1, settings.gather_rays // 4), settings.seed, settings.cones_count, cone, part.with_before)
+        fewer = Gatherer(
+            scene, world, max(1, settings.gather_rays // 4), settings.seed, settings.cones_count, cone, part.with_before
+        )
         return gather_all(launcher, part.points, part.count, fewer)
     pixel = point_pixels(launcher, buffer)
-    synthetic = Gatherer(scene, world, settings.gather_object_rays, settings.seed, settings.cones_count, cone, part.with_before)
+    synthetic = Gatherer(
+        scene, world, settings.gather_object_rays, settings.seed, settings.cones_count, cone, part.with_before
+    )
     before, after = gather_sparse(
         launcher,
         buffer,
@@ -321,13 +335,15 @@ def _irradiance(
     return before, after
 
 
-def _shade_specular(launcher: Launcher, scene: DeviceScene, plan: Plan, world: Any, part: _Part) -> None:
+def _shade_specular(launcher: Launcher, scene: DeviceScene, plan: Plan, light_field: LightField, part: _Part) -> None:
     settings = plan.settings
     index, count = find_glossy(launcher, part.points, part.count, plan.alpha_max)
-    glossy = gather.Glossy()
+    glossy = specular.Glossy()
     glossy.rays = settings.glossy_rays
     glossy.light_samples = settings.shadows_samples
     glossy.seed = settings.seed
+    glossy.alpha_max = plan.alpha_max
+    glossy.again = int(settings.bounces > 1)
     cone = _cone(plan) if settings.glossy == "cones" else None
     shade_specular(
         launcher,
@@ -335,7 +351,8 @@ def _shade_specular(launcher: Launcher, scene: DeviceScene, plan: Plan, world: A
         part.points,
         index,
         count,
-        world,
+        light_field.world,
+        light_field.bounces,
         glossy=glossy,
         cone=cone,
         light=part.light,

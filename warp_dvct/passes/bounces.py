@@ -9,6 +9,8 @@ import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import bounces as kernels
+from warp_dvct.kernels.bounce_field import BounceField
+from warp_dvct.kernels.volume import Volume
 from warp_dvct.kernels.voxelization import EMPTY_KEY
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.voxels import Voxels, count_below, sort_by_key, unique_runs
@@ -142,22 +144,26 @@ def solve_bounces(
     return total
 
 
-def reinject(launcher: Launcher, voxels: Voxels, albedo: Any, flux: Any, patches: Patches, total: Any) -> None:
-    """Add what the patches' irradiance makes a volume's surfaces reflect to ``flux``, in place."""
+def bounce_field(launcher: Launcher, patches: Patches | None, total: Any = None) -> Any:
+    """``BounceField`` of solved patches, or one that says that there are none."""
+    field = BounceField()
+    field.present = int(patches is not None)
+    if patches is None:
+        field.volume = Volume()
+        field.table, field.real = launcher.zeros(1, wp.int32), launcher.zeros(1, wp.int32)
+        field.irradiance = launcher.zeros(1, wp.vec3)
+        return field
+    field.volume = patches.voxels.volume
+    field.level, field.level_first = patches.level, patches.level_first
+    field.table, field.real, field.irradiance = patches.table, patches.data.real, total
+    return field
+
+
+def reinject(launcher: Launcher, voxels: Voxels, albedo: Any, flux: Any, field: Any) -> None:
+    """Add what a volume's surfaces reflect of a ``BounceField`` to ``flux``, in place."""
     launcher.launch(
         kernels._reinject,
         voxels.level_records[0],
-        [
-            voxels.level_keys[0],
-            voxels.volume,
-            voxels.area,
-            albedo,
-            patches.voxels.volume,
-            patches.level,
-            patches.level_first,
-            patches.table,
-            patches.data,
-            total,
-        ],
+        [voxels.level_keys[0], voxels.volume, voxels.area, albedo, field],
         [flux],
     )

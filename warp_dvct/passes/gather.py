@@ -129,53 +129,9 @@ def shade_indirect(
     with_before: bool,
 ) -> None:
     """Add diffusely reflected irradiance to ``light`` (and ``before``): Franke 2014, eqs. 6 and 8, first terms."""
-    launcher.launch(
-        kernels._shade_indirect, count, [points, *irradiance, alpha_max, int(with_before)], [light, before]
-    )
-
-
-def shade_specular(
-    launcher: Launcher,
-    scene: DeviceScene,
-    points: Any,
-    index: Any,
-    count: int,
-    world: Any,
-    *,
-    glossy: Any,
-    cone: Any,
-    light: Any,
-    before: Any,
-    with_before: bool,
-) -> None:
-    """Add specular reflections at the ``count`` points listed in ``index``: eqs. 6 and 8, second terms.
-
-    By exact visible-normal rays, or by one cone as wide as the lobe where ``cone`` is given.
-    """
-    if cone is None:
-        launcher.launch(
-            kernels._shade_specular_rays,
-            count,
-            [points, index, scene.geometry, world, scene.lights, glossy, int(with_before)],
-            [light, before],
-        )
-    else:
-        launcher.launch(
-            kernels._shade_specular_cones,
-            count,
-            [points, index, scene.geometry, world, cone, int(with_before)],
-            [light, before],
-        )
+    launcher.launch(kernels._shade_indirect, count, [points, *irradiance, alpha_max, int(with_before)], [light, before])
 
 
 def merge(launcher: Launcher, into: tuple[Any, Any], other: tuple[Any, Any]) -> None:
     """Add irradiance gathered for one role to that of the other; each is 0 at the points of the other."""
     launcher.launch(kernels._merge, into[0].shape[0], [*other], [*into])
-
-
-def find_glossy(launcher: Launcher, points: Any, count: int, alpha_max: float) -> tuple[Any, int]:
-    """Indices of the points whose specular lobe has a GGX alpha up to ``alpha_max``, and their number."""
-    mark = launcher.zeros(max(1, count), wp.int32)
-    launcher.launch(kernels._mark_glossy, count, [points, alpha_max], [mark])
-    _, index, found = compact(launcher, mark)
-    return index, found

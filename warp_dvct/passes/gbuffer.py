@@ -97,7 +97,9 @@ def extended(launcher: Launcher, points: Any, old: int, count: int) -> Any:
     return larger
 
 
-def _look_behind(launcher: Launcher, scene: DeviceScene, points: Any, count: int, width: int) -> tuple[Any, Any, Any, int]:
+def _look_behind(
+    launcher: Launcher, scene: DeviceScene, points: Any, count: int, width: int
+) -> tuple[Any, Any, Any, int]:
     mark = launcher.zeros(count, wp.int32)
     launcher.launch(kernels._mark_synthetic, count, [points], [mark])
     rank, index, hidden = compact(launcher, mark)

@@ -30,9 +30,7 @@ def shade_direct(
     Franke 2014, eqs. 5 and 7: after on synthetic points, after - before on real ones. Domes are left to the gather.
     """
     if cone is None:
-        launcher.launch(
-            kernels._shade_direct, count, [points, scene.geometry, scene.lights, direct], [light, before]
-        )
+        launcher.launch(kernels._shade_direct, count, [points, scene.geometry, scene.lights, direct], [light, before])
     else:
         launcher.launch(
             kernels._shade_direct_cones,

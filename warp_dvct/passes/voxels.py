@@ -71,7 +71,9 @@ class Voxels:
     fragments: Fragments
 
 
-def voxelize(launcher: Launcher, triangles: Any, normals: Any, double_sided: Any, synthetic_first: int, box: Box) -> Voxels:
+def voxelize(
+    launcher: Launcher, triangles: Any, normals: Any, double_sided: Any, synthetic_first: int, box: Box
+) -> Voxels:
     """Cut triangles by the voxel grid and build the brick maps of all levels.
 
     Args:
