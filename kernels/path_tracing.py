@@ -187,7 +187,7 @@ def make_vertex(origin: wp.vec3, direction: wp.vec3, throughput: wp.vec3, depth:
     return v
 
 
-@wp.func
+@wp.func(inline=False)  # it is called in three places of two kernels; CUDA builds would hold twelve copies
 def follow(
     geo: Geometry,
     mats: Materials,
@@ -287,7 +287,7 @@ def follow_pair(
     return out
 
 
-@wp.func
+@wp.func(inline=False)
 def trace_pair(
     geo: Geometry,
     mats: Materials,
