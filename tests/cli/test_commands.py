@@ -6,10 +6,28 @@ import io
 import json
 from importlib.metadata import version
 
-from warp_dvct import usd_scenes
-from warp_dvct.cli import progress
+import click
+
+from warp_dvct import relighter, settings, usd_scenes
+from warp_dvct.cli import options, progress
 from warp_dvct.cli.progress import Progress
+from warp_dvct.cli.relight import relight
 from warp_dvct.cli.warmup import kernel_modules
+from warp_dvct.passes.tonemap import CURVES
+
+
+def test_choices_are_those_of_the_package():
+    """They are written down twice, so that --help starts neither Warp nor USD."""
+    assert options.METHODS == relighter.METHODS
+    assert options.QUALITIES == settings.QUALITIES
+    (curve,) = (option for option in relight.params if option.name == "curve")
+    assert isinstance(curve.type, click.Choice)
+    assert tuple(curve.type.choices) == tuple(CURVES)
+
+
+def test_settings_are_listed(command):
+    listing = command("settings").out.splitlines()
+    assert [line.partition("=")[0] for line in listing] == list(settings.NAMES)
 
 
 def test_help_and_version(command):
