@@ -160,6 +160,11 @@ def field_of(voxels: Voxels, level: int) -> np.ndarray:
     return dense(voxels, field, level)
 
 
+def launcher_vectors(launcher: Launcher, values: np.ndarray) -> Any:
+    """Host values ``[n, 3]`` as a vec3 array."""
+    return launcher.array(np.asarray(values, np.float32).reshape(-1, 3), wp.vec3)
+
+
 def uniform_flux(launcher: Launcher, voxels: Voxels, radiosity: np.ndarray) -> Any:
     """Flux of surfaces that all have radiosity ``[3]``, or one per solution ``[2, 3]``."""
     value = np.broadcast_to(np.asarray(radiosity, float), (2, 3))
