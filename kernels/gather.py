@@ -221,37 +221,6 @@ def cone_incident(
 
 
 @wp.kernel
-def _choose_points(
-    first: int,
-    points: Points,
-    width: int,
-    height: int,
-    stride: int,
-    columns: int,
-    role: int,
-    seed: int,
-    choice_out: wp.array(dtype=wp.int32),
-):
-    """The pixel that stands for a ``stride`` x ``stride`` block: a hashed one if it has the role, else the next that
-    has; -1 where none has."""
-    i = first + wp.tid()
-    bx = (i % columns) * stride
-    by = (i / columns) * stride
-    cells = stride * stride
-    start = int(uniform1(seed, i, 0, 7) * float(cells))
-    found = int(-1)
-    for k in range(cells):
-        if found < 0:
-            cell = (start + k) % cells
-            x = bx + cell % stride
-            y = by + cell / stride
-            if x < width and y < height:
-                if points.role[y * width + x] == role:
-                    found = y * width + x
-    choice_out[i] = found
-
-
-@wp.kernel
 def _gather_rays(
     first: int,
     points: Points,
@@ -262,10 +231,15 @@ def _gather_rays(
     seed: int,
     before_out: wp.array(dtype=wp.vec3),
     after_out: wp.array(dtype=wp.vec3),
+    nearness_out: wp.array(dtype=wp.float32),
 ):
-    """Irradiance [W m^-2] from indirect light and domes, by cosine-distributed exact rays (eq. 6's integral)."""
+    """Irradiance [W m^-2] from indirect light and domes, by cosine-distributed exact rays (eq. 6's integral).
+
+    ``nearness_out`` is the mean inverse distance of what the rays met.
+    """
     i = first + wp.tid()
     j = index_in[i]
+    nearness = float(0.0)
     before = wp.vec3(0.0, 0.0, 0.0)
     after = wp.vec3(0.0, 0.0, 0.0)
     if j >= 0:
@@ -279,8 +253,10 @@ def _gather_rays(
                     light = ray_incident(world, geo, spawn_point(s, direction), direction, solid_angle)
                     before += light.before
                     after += light.after
+                    nearness += 1.0 / wp.max(wp.min(light.distance_before, light.distance_after), 1.0e-6)
     before_out[i] = before / float(rays)
     after_out[i] = after / float(rays)
+    nearness_out[i] = nearness / float(rays)
 
 
 @wp.kernel
@@ -327,96 +303,6 @@ def _gather_cones(
     after_out[i] = after / float(cones)
 
 
-@wp.struct
-class Guide:
-    """How far a gathered point may lend its irradiance to another."""
-
-    stride: wp.int32
-    columns: wp.int32
-    rows: wp.int32
-    radius: wp.int32  # blocks to each side
-    plane: wp.float32  # tolerated distance off the tangent plane, in pixel footprints times stride
-    sharpness: wp.float32  # exponent of the normals' cosine
-
-
-@wp.kernel
-def _reconstruct(
-    first: int,
-    points: Points,
-    pixel_in: wp.array(dtype=wp.int32),
-    width: int,
-    role: int,
-    guide: Guide,
-    choice_in: wp.array(dtype=wp.int32),
-    before_in: wp.array(dtype=wp.vec3),
-    after_in: wp.array(dtype=wp.vec3),
-    before_out: wp.array(dtype=wp.vec3),
-    after_out: wp.array(dtype=wp.vec3),
-    missing_out: wp.array(dtype=wp.int32),
-):
-    """Irradiance of every point of a role from the gathered ones around, weighted by distance, plane and normal.
-
-    ``missing_out`` is 1 where none of them lies on the same surface.
-    """
-    i = first + wp.tid()
-    missing = int(0)
-    if points.role[i] == role:
-        pixel = pixel_in[i]
-        px = float(pixel % width) + 0.5
-        py = float(pixel / width) + 0.5
-        stride = float(guide.stride)
-        cx = int(wp.floor(px / stride))
-        cy = int(wp.floor(py / stride))
-        position = points.position[i]
-        normal_g = points.normal_g[i]
-        normal = points.normal[i]
-        reach = guide.plane * stride * points.footprint[i]
-        total = float(0.0)
-        before = wp.vec3(0.0, 0.0, 0.0)
-        after = wp.vec3(0.0, 0.0, 0.0)
-        for by in range(wp.max(cy - guide.radius, 0), wp.min(cy + guide.radius, guide.rows - 1) + 1):
-            for bx in range(wp.max(cx - guide.radius, 0), wp.min(cx + guide.radius, guide.columns - 1) + 1):
-                block = by * guide.columns + bx
-                j = choice_in[block]
-                if j >= 0:
-                    facing = wp.dot(normal, points.normal[j])
-                    if facing > 0.0:
-                        offset = points.position[j] - position
-                        gap = (
-                            wp.max(wp.abs(wp.dot(offset, normal_g)), wp.abs(wp.dot(offset, points.normal_g[j]))) / reach
-                        )
-                        dx = (float(j % width) + 0.5 - px) / stride
-                        dy = (float(j / width) + 0.5 - py) / stride
-                        width2 = float(guide.radius) + 0.5
-                        near = wp.max(0.0, 1.0 - (dx * dx + dy * dy) / (width2 * width2))
-                        weight = near * near * wp.pow(facing, guide.sharpness) * wp.exp(-gap * gap)
-                        if weight > 1.0e-4:
-                            total += weight
-                            before += before_in[block] * weight
-                            after += after_in[block] * weight
-        if total > 1.0e-3:
-            before_out[i] = before / total
-            after_out[i] = after / total
-        else:
-            missing = 1
-    missing_out[i] = missing
-
-
-@wp.kernel
-def _scatter_missing(
-    first: int,
-    index_in: wp.array(dtype=wp.int32),
-    before_in: wp.array(dtype=wp.vec3),
-    after_in: wp.array(dtype=wp.vec3),
-    before_out: wp.array(dtype=wp.vec3),
-    after_out: wp.array(dtype=wp.vec3),
-):
-    """Put what was gathered at listed points where they are; every point is listed once."""
-    i = first + wp.tid()
-    before_out[index_in[i]] = before_in[i]
-    after_out[index_in[i]] = after_in[i]
-
-
 @wp.func
 def diffuse_reflectance(s: Surface, wo: wp.vec3, alpha_max: float) -> wp.vec3:
     """Radiance per irradiance of hemispherical light: the Lambert lobe under its interface, and a GGX lobe that is too
@@ -453,35 +339,3 @@ def _shade_indirect(
             light_out[i] += wp.cw_mul(reflectance, after_in[i] - before_in[i])
             if with_before != 0:
                 radiance_before_out[i] += wp.cw_mul(reflectance, before_in[i])
-
-
-@wp.kernel
-def _point_pixels(
-    first: int, edge_pixel_in: wp.array(dtype=wp.int32), pixels: int, samples: int, pixel_out: wp.array(dtype=wp.int32)
-):
-    """The pixel that each shading point belongs to."""
-    i = first + wp.tid()
-    pixel = i
-    if i >= pixels:
-        pixel = edge_pixel_in[(i - pixels) / samples]
-    pixel_out[i] = pixel
-
-
-@wp.kernel
-def _mark_role(first: int, points: Points, role: int, mark_out: wp.array(dtype=wp.int32)):
-    i = first + wp.tid()
-    mark_out[i] = wp.where(points.role[i] == role, 1, 0)
-
-
-@wp.kernel
-def _merge(
-    first: int,
-    before_in: wp.array(dtype=wp.vec3),
-    after_in: wp.array(dtype=wp.vec3),
-    before_out: wp.array(dtype=wp.vec3),
-    after_out: wp.array(dtype=wp.vec3),
-):
-    """Join two sets of irradiance, each zero at the points of the other."""
-    i = first + wp.tid()
-    before_out[i] += before_in[i]
-    after_out[i] += after_in[i]

@@ -37,7 +37,7 @@ class Settings:
     volume_coarse: int = _knob(128, "voxels an edge of the volume around the fine one; 0 for none", low=0, high=1024)
     volume_reach: float = _knob(16.0, "largest edge of the coarse volume, in edges of the fine one", low=1.0, high=1e4)
 
-    rsm_texels: int = _knob(1024, "most texels an edge of a reflective shadow map", low=1, high=8192)
+    rsm_texels: int = _knob(512, "most texels an edge of a reflective shadow map", low=1, high=8192)
     rsm_density: float = _knob(1.0, "texels per voxel edge at the volume's far side", low=0.01, high=16.0)
 
     shadows: str = _knob("ray", "how direct shadows are found", choices=("ray", "cone"))
@@ -49,10 +49,11 @@ class Settings:
 
     gather: str = _knob("rays", "how diffuse indirect light is gathered", choices=("rays", "cones"))
     gather_rays: int = _knob(64, "rays per gather point on real surfaces", low=1, high=65536)
-    gather_stride: int = _knob(4, "pixels between gather points on real surfaces; 1 for every pixel", low=1, high=64)
+    gather_stride: int = _knob(6, "pixels between gather points on real surfaces; 1 for every pixel", low=1, high=64)
     gather_object_rays: int = _knob(64, "rays per gather point on synthetic surfaces", low=1, high=65536)
-    gather_object_stride: int = _knob(2, "pixels between gather points on synthetic surfaces", low=1, high=64)
-    gather_radius: int = _knob(2, "gather points to each side that reconstruction looks at", low=0, high=16)
+    gather_object_stride: int = _knob(3, "pixels between gather points on synthetic surfaces", low=1, high=64)
+    gather_smoothing: int = _knob(1, "a-trous steps that smooth what rays gathered; 0 for none", low=0, high=6)
+    gather_radius: int = _knob(1, "gather points to each side that reconstruction looks at", low=0, high=16)
 
     cones_count: int = _knob(9, "diffuse cones", low=4, high=36)
     cones_aperture: float = _knob(
@@ -73,22 +74,50 @@ class Settings:
     patches_count: int = _knob(8192, "about how many patches carry the second and further bounces", low=8, high=2**22)
     patches_rays: int = _knob(64, "rays per patch", low=1, high=65536)
 
+    visibility: str = _knob("ism", "how VPLs see: imperfect shadow maps or exact rays", choices=("ism", "ray"))
+    shadow_maps: str = _knob(
+        "double", "maps of real and synthetic surfaces apart, or the single one of 2010", choices=("double", "single")
+    )
+    vpls_count: int = _knob(256, "virtual point lights of the first bounce", low=1, high=2**17)
+    vpls_further: int = _knob(128, "virtual point lights of each further bounce", low=1, high=2**17)
+    vpls_sky: int = _knob(256, "virtual point lights on the sky, where there is a dome", low=1, high=2**17)
+    vpls_map: int = _knob(256, "texels an edge of the maps that VPLs are drawn from", low=1, high=4096)
+    vpls_focus: float = _knob(0.5, "how much nearness to synthetic objects attracts VPLs", low=0.0, high=1.0)
+    vpls_least: float = _knob(
+        0.15, "least share of VPLs on synthetic surfaces and on real ones behind; 0 by area", low=0.0, high=0.4
+    )
+    vpls_clamp: float = _knob(
+        1.0, "radius of a VPL's disc, over that of its share of surface; 0 for points", low=0.0, high=16.0
+    )
+    vpls_tiles: int = _knob(
+        4, "edge of the tiles whose pixels share the VPLs out; 1 for all at every pixel", low=1, high=16
+    )
+    vpls_sources: int = _knob(4, "VPLs that a candidate for a further bounce tries", low=1, high=1024)
+    vpls_slots: str = _knob("drawn", "which candidate gets a slot of a further bounce", choices=("drawn", "strongest"))
+    ism_size: int = _knob(128, "texels an edge of an imperfect shadow map", low=8, high=2048)
+    ism_points: int = _knob(1024, "points per map", low=1, high=2**20)
+    ism_blocks: int = _knob(16, "different sets of points that the maps share", low=1, high=4096)
+    ism_grow: float = _knob(1.3, "radius of a splat, over that of the surface its point stands for", low=0.1, high=8.0)
+    ism_bias: float = _knob(0.03, "relative depth by which a blocker has to be nearer", low=0.0, high=1.0)
+
     samples: int = _knob(64, "path-trace: samples per pixel", low=1, high=2**20)
 
 
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
-        "bounces": 1,
-        "volume.resolution": 64,
+        "bounces": 2,
+        "volume.resolution": 96,
         "volume.coarse": 64,
-        "rsm.texels": 256,
-        "shadows.samples": 4,
+        "rsm.texels": 192,
+        "antialias": 3,
+        "shadows.samples": 6,
+        "shadows.probes": 6,
         "gather.rays": 24,
-        "gather.stride": 6,
+        "gather.stride": 8,
         "gather.object_rays": 24,
-        "gather.object_stride": 3,
+        "gather.object_stride": 4,
         "glossy.rays": 2,
-        "patches.count": 2048,
+        "patches.count": 1024,
         "patches.rays": 32,
         "samples": 16,
     },
@@ -96,14 +125,14 @@ PRESETS: dict[str, dict[str, Any]] = {
     "high": {
         "bounces": 12,
         "antialias": 8,
-        "shadows.samples": 64,
-        "rsm.texels": 2048,
-        "rsm.density": 1.5,
-        "gather.rays": 256,
-        "gather.stride": 3,
-        "gather.object_rays": 256,
-        "gather.object_stride": 1,
-        "glossy.rays": 32,
+        "shadows.samples": 32,
+        "shadows.probes": 16,
+        "rsm.texels": 1024,
+        "gather.rays": 128,
+        "gather.stride": 4,
+        "gather.object_rays": 128,
+        "gather.object_stride": 2,
+        "glossy.rays": 24,
         "patches.count": 16384,
         "patches.rays": 128,
         "samples": 512,
@@ -112,7 +141,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 _FIELDS = {f.name: f for f in fields(Settings)}
 # A dot stands only where the first word names a group, so that ``gather_object_rays`` is ``gather.object_rays``.
-NAMES = {f.replace("_", ".", 1): f for f in _FIELDS}
+UNGROUPED = {"shadow_maps"}
+NAMES = {f if f in UNGROUPED else f.replace("_", ".", 1): f for f in _FIELDS}
 
 
 def make_settings(quality: str = "balanced", overrides: Mapping[str, Any] | None = None) -> Settings:

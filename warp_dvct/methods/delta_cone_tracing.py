@@ -320,6 +320,7 @@ def _irradiance(
         real,
         stride=settings.gather_stride,
         radius=settings.gather_radius,
+        smoothing=settings.gather_smoothing,
     )
     if scene.synthetic is not None:
         object_before, object_after = gather_sparse(
@@ -330,6 +331,7 @@ def _irradiance(
             synthetic,
             stride=settings.gather_object_stride,
             radius=settings.gather_radius,
+            smoothing=settings.gather_smoothing,
         )
         merge(launcher, (before, after), (object_before, object_after))
     return before, after

@@ -9,12 +9,14 @@ import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import gather as kernels
+from warp_dvct.kernels import reconstruction
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.gbuffer import GBuffer, compact
 from warp_dvct.scene import Role
 
 PLANE_TOLERANCE = 0.5  # distance off the tangent plane, in gather strides, at which a gathered point counts 1/e
 NORMAL_SHARPNESS = 8.0  # exponent of the normals' cosine
+SMOOTH_REACH = 0.25  # smoothing distance over the harmonic mean distance to the surfaces around
 
 
 @dataclass(frozen=True)
@@ -29,8 +31,13 @@ class Gatherer:
     cone: Any = None
     with_before: bool = True
 
-    def run(self, launcher: Launcher, points: Any, index: Any, count: int) -> tuple[Any, Any]:
-        """Irradiance [W m^-2] before and after at points ``index`` (-1 gives 0): two vec3 ``[count]``."""
+    def run(self, launcher: Launcher, points: Any, index: Any, count: int, nearness: Any = None) -> tuple[Any, Any]:
+        """Irradiance [W m^-2] before and after at points ``index`` (-1 gives 0): two vec3 ``[count]``.
+
+        ``nearness``, float ``[count]``, receives the mean inverse distance of what rays met (cones leave it alone).
+        """
+        if nearness is None:
+            nearness = launcher.empty(max(1, count), wp.float32)
         before = launcher.empty(max(1, count), wp.vec3)
         after = launcher.empty(max(1, count), wp.vec3)
         if self.cone is None:
@@ -38,7 +45,7 @@ class Gatherer:
                 kernels._gather_rays,
                 count,
                 [points, index, self.scene.geometry, self.world, self.rays, self.seed],
-                [before, after],
+                [before, after, nearness],
             )
         else:
             launcher.launch(
@@ -63,7 +70,7 @@ def point_pixels(launcher: Launcher, buffer: GBuffer) -> Any:
     """The pixel of each shading point, int ``[count]``."""
     pixel = launcher.empty(buffer.count, wp.int32)
     launcher.launch(
-        kernels._point_pixels,
+        reconstruction._point_pixels,
         buffer.count,
         [buffer.edge_pixel, buffer.width * buffer.height, max(1, buffer.edge_samples)],
         [pixel],
@@ -72,11 +79,20 @@ def point_pixels(launcher: Launcher, buffer: GBuffer) -> Any:
 
 
 def gather_sparse(
-    launcher: Launcher, buffer: GBuffer, pixel: Any, role: Role, gatherer: Gatherer, *, stride: int, radius: int
+    launcher: Launcher,
+    buffer: GBuffer,
+    pixel: Any,
+    role: Role,
+    gatherer: Gatherer,
+    *,
+    stride: int,
+    radius: int,
+    smoothing: int = 0,
 ) -> tuple[Any, Any]:
     """Irradiance, before and after, at every shading point of a role.
 
-    One pixel of each ``stride`` x ``stride`` block is gathered; the others are reconstructed from the blocks within
+    One pixel of each ``stride`` x ``stride`` block is gathered; ``smoothing`` a-trous steps average the gathered values
+    as far as the distance to what they see allows; the others are reconstructed from the blocks within
     ``radius`` that lie on the same surface. Points without any such block are gathered themselves.
 
     Returns:
@@ -85,28 +101,40 @@ def gather_sparse(
     columns, rows = -(-buffer.width // stride), -(-buffer.height // stride)
     choice = launcher.empty(columns * rows, wp.int32)
     launcher.launch(
-        kernels._choose_points,
+        reconstruction._choose_points,
         columns * rows,
         [buffer.points, buffer.width, buffer.height, stride, columns, int(role), gatherer.seed],
         [choice],
     )
-    sparse_before, sparse_after = gatherer.run(launcher, buffer.points, choice, columns * rows)
-    guide = kernels.Guide()
+    nearness = launcher.zeros(columns * rows, wp.float32)
+    sparse = gatherer.run(launcher, buffer.points, choice, columns * rows, nearness)
+    guide = reconstruction.Guide()
     guide.stride, guide.columns, guide.rows = stride, columns, rows
+    guide.plane, guide.sharpness, guide.reach = PLANE_TOLERANCE, NORMAL_SHARPNESS, SMOOTH_REACH
+    guide.radius = 2
+    if gatherer.cone is None:
+        for step in range(smoothing):
+            smoothed = launcher.empty(columns * rows, wp.vec3), launcher.empty(columns * rows, wp.vec3)
+            launcher.launch(
+                reconstruction._smooth,
+                columns * rows,
+                [buffer.points, choice, guide, 1 << step, *sparse, nearness],
+                [*smoothed],
+            )
+            sparse = smoothed
     guide.radius = radius if stride > 1 else min(radius, 1)
-    guide.plane, guide.sharpness = PLANE_TOLERANCE, NORMAL_SHARPNESS
     before = launcher.zeros(buffer.count, wp.vec3)
     after = launcher.zeros(buffer.count, wp.vec3)
     missing = launcher.empty(buffer.count, wp.int32)
     launcher.launch(
-        kernels._reconstruct,
+        reconstruction._reconstruct,
         buffer.count,
-        [buffer.points, pixel, buffer.width, int(role), guide, choice, sparse_before, sparse_after],
+        [buffer.points, pixel, buffer.width, int(role), guide, choice, *sparse],
         [before, after, missing],
     )
     _, index, left = compact(launcher, missing)
     left_before, left_after = gatherer.run(launcher, buffer.points, index, left)
-    launcher.launch(kernels._scatter_missing, left, [index, left_before, left_after], [before, after])
+    launcher.launch(reconstruction._scatter_missing, left, [index, left_before, left_after], [before, after])
     return before, after
 
 
@@ -134,4 +162,4 @@ def shade_indirect(
 
 def merge(launcher: Launcher, into: tuple[Any, Any], other: tuple[Any, Any]) -> None:
     """Add irradiance gathered for one role to that of the other; each is 0 at the points of the other."""
-    launcher.launch(kernels._merge, into[0].shape[0], [*other], [*into])
+    launcher.launch(reconstruction._merge, into[0].shape[0], [*other], [*into])

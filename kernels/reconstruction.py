@@ -1,0 +1,209 @@
+"""Sparse gathering: which points are gathered, and guided reconstruction at all others."""
+
+import warp as wp
+
+from warp_dvct.kernels.gbuffer import Points
+from warp_dvct.kernels.sampling import uniform1
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def _choose_points(
+    first: int,
+    points: Points,
+    width: int,
+    height: int,
+    stride: int,
+    columns: int,
+    role: int,
+    seed: int,
+    choice_out: wp.array(dtype=wp.int32),
+):
+    """The pixel that stands for a ``stride`` x ``stride`` block: a hashed one if it has the role, else the next that
+    has; -1 where none has."""
+    i = first + wp.tid()
+    bx = (i % columns) * stride
+    by = (i / columns) * stride
+    cells = stride * stride
+    start = int(uniform1(seed, i, 0, 7) * float(cells))
+    found = int(-1)
+    for k in range(cells):
+        if found < 0:
+            cell = (start + k) % cells
+            x = bx + cell % stride
+            y = by + cell / stride
+            if x < width and y < height:
+                if points.role[y * width + x] == role:
+                    found = y * width + x
+    choice_out[i] = found
+
+
+@wp.struct
+class Guide:
+    """How far a gathered point may lend its irradiance to another."""
+
+    stride: wp.int32
+    columns: wp.int32
+    rows: wp.int32
+    radius: wp.int32  # blocks to each side
+    plane: wp.float32  # tolerated distance off the tangent plane, in pixel footprints times stride
+    sharpness: wp.float32  # exponent of the normals' cosine
+    reach: wp.float32  # smoothing: tolerated distance over the mean distance of the surfaces around
+
+
+@wp.func
+def same_surface(points: Points, i: int, j: int, guide: Guide) -> float:
+    """Weight in [0, 1] by how well two points lie in each other's tangent plane and face the same way."""
+    facing = wp.dot(points.normal[i], points.normal[j])
+    if facing <= 0.0:
+        return 0.0
+    offset = points.position[j] - points.position[i]
+    gap = wp.max(wp.abs(wp.dot(offset, points.normal_g[i])), wp.abs(wp.dot(offset, points.normal_g[j])))
+    gap = gap / (guide.plane * float(guide.stride) * points.footprint[i])
+    return wp.pow(facing, guide.sharpness) * wp.exp(-gap * gap)
+
+
+@wp.kernel
+def _smooth(
+    first: int,
+    points: Points,
+    choice_in: wp.array(dtype=wp.int32),
+    guide: Guide,
+    spacing: int,
+    before_in: wp.array(dtype=wp.vec3),
+    after_in: wp.array(dtype=wp.vec3),
+    nearness_in: wp.array(dtype=wp.float32),
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+):
+    """One a-trous step over the gathered points: an average of those on the same surface, as far as irradiance can be
+    smooth there, that is over a share of the harmonic mean distance to what they see (Ward et al. 1988)."""
+    i = first + wp.tid()
+    at = choice_in[i]
+    total = float(1.0)
+    before = before_in[i]
+    after = after_in[i]
+    if at >= 0:
+        cx = i % guide.columns
+        cy = i / guide.columns
+        position = points.position[at]
+        for dy in range(-guide.radius, guide.radius + 1):
+            for dx in range(-guide.radius, guide.radius + 1):
+                bx = cx + dx * spacing
+                by = cy + dy * spacing
+                if (dx != 0 or dy != 0) and bx >= 0 and by >= 0 and bx < guide.columns and by < guide.rows:
+                    block = by * guide.columns + bx
+                    j = choice_in[block]
+                    if j >= 0:
+                        # Both must see far: a smooth point does not smooth one at a contact.
+                        inverse = wp.max(nearness_in[i], nearness_in[block]) / guide.reach
+                        apart = wp.length(points.position[j] - position) * inverse
+                        weight = same_surface(points, at, j, guide) * wp.exp(-apart * apart)
+                        if weight > 1.0e-3:
+                            total += weight
+                            before += before_in[block] * weight
+                            after += after_in[block] * weight
+    before_out[i] = before / total
+    after_out[i] = after / total
+
+
+@wp.kernel
+def _reconstruct(
+    first: int,
+    points: Points,
+    pixel_in: wp.array(dtype=wp.int32),
+    width: int,
+    role: int,
+    guide: Guide,
+    choice_in: wp.array(dtype=wp.int32),
+    before_in: wp.array(dtype=wp.vec3),
+    after_in: wp.array(dtype=wp.vec3),
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+    missing_out: wp.array(dtype=wp.int32),
+):
+    """Irradiance of every point of a role from the gathered ones around, weighted by distance, plane and normal.
+
+    ``missing_out`` is 1 where none of them lies on the same surface.
+    """
+    i = first + wp.tid()
+    missing = int(0)
+    if points.role[i] == role:
+        pixel = pixel_in[i]
+        px = float(pixel % width) + 0.5
+        py = float(pixel / width) + 0.5
+        stride = float(guide.stride)
+        cx = int(wp.floor(px / stride))
+        cy = int(wp.floor(py / stride))
+        extent = float(guide.radius) + 0.5
+        total = float(0.0)
+        before = wp.vec3(0.0, 0.0, 0.0)
+        after = wp.vec3(0.0, 0.0, 0.0)
+        for by in range(wp.max(cy - guide.radius, 0), wp.min(cy + guide.radius, guide.rows - 1) + 1):
+            for bx in range(wp.max(cx - guide.radius, 0), wp.min(cx + guide.radius, guide.columns - 1) + 1):
+                block = by * guide.columns + bx
+                j = choice_in[block]
+                if j >= 0:
+                    dx = (float(j % width) + 0.5 - px) / stride
+                    dy = (float(j / width) + 0.5 - py) / stride
+                    near = wp.max(0.0, 1.0 - (dx * dx + dy * dy) / (extent * extent))
+                    if near > 0.0:
+                        weight = near * near * same_surface(points, i, j, guide)
+                        if weight > 1.0e-4:
+                            total += weight
+                            before += before_in[block] * weight
+                            after += after_in[block] * weight
+        if total > 1.0e-3:
+            before_out[i] = before / total
+            after_out[i] = after / total
+        else:
+            missing = 1
+    missing_out[i] = missing
+
+
+@wp.kernel
+def _scatter_missing(
+    first: int,
+    index_in: wp.array(dtype=wp.int32),
+    before_in: wp.array(dtype=wp.vec3),
+    after_in: wp.array(dtype=wp.vec3),
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+):
+    """Put what was gathered at listed points where they are; every point is listed once."""
+    i = first + wp.tid()
+    before_out[index_in[i]] = before_in[i]
+    after_out[index_in[i]] = after_in[i]
+
+
+@wp.kernel
+def _point_pixels(
+    first: int, edge_pixel_in: wp.array(dtype=wp.int32), pixels: int, samples: int, pixel_out: wp.array(dtype=wp.int32)
+):
+    """The pixel that each shading point belongs to."""
+    i = first + wp.tid()
+    pixel = i
+    if i >= pixels:
+        pixel = edge_pixel_in[(i - pixels) / samples]
+    pixel_out[i] = pixel
+
+
+@wp.kernel
+def _mark_role(first: int, points: Points, role: int, mark_out: wp.array(dtype=wp.int32)):
+    i = first + wp.tid()
+    mark_out[i] = wp.where(points.role[i] == role, 1, 0)
+
+
+@wp.kernel
+def _merge(
+    first: int,
+    before_in: wp.array(dtype=wp.vec3),
+    after_in: wp.array(dtype=wp.vec3),
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+):
+    """Join two sets of irradiance, each zero at the points of the other."""
+    i = first + wp.tid()
+    before_out[i] += before_in[i]
+    after_out[i] += after_in[i]

@@ -1,0 +1,360 @@
+"""Differential instant radiosity (Knecht et al. 2012): relight a real scene by virtual point lights.
+
+What it costs: a pair of reflective shadow maps per light, two imperfect shadow maps per VPL, and one visibility test
+per pixel and VPL of its interleaved set. Where it is wrong: VPLs are few, so indirect light has their pattern; near
+surfaces they light as discs, which is too dark in corners; imperfect shadow maps lose what is thinner than their
+points' distances; VPLs are diffuse, so light that a glossy surface focuses onto others is spread.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_dvct.device_scene import DeviceScene
+from warp_dvct.kernels import shading, specular
+from warp_dvct.kernels.vpls import Vpls
+from warp_dvct.launch import Launcher
+from warp_dvct.layers import Radiance
+from warp_dvct.passes.environment import build_environment
+from warp_dvct.passes.gather import shade_indirect
+from warp_dvct.passes.gbuffer import GBuffer, render_gbuffer
+from warp_dvct.passes.ism import draw_isms, new_isms, ray_sight
+from warp_dvct.passes.point_cloud import SurfacePoints, sample_surfaces
+from warp_dvct.passes.resolve import resolve
+from warp_dvct.passes.shading import shade_direct
+from warp_dvct.passes.specular import find_glossy
+from warp_dvct.passes.vpl_shading import (
+    VplLight,
+    bounce_vpls,
+    light_picture,
+    light_points,
+    shade_direct_single,
+    shade_glossy,
+)
+from warp_dvct.passes.vpls import Region, choose_sky, choose_vpls, light_maps, new_vpls, spread_vpls
+from warp_dvct.plan import Plan
+from warp_dvct.scene import Light, LightKind, LightRole, Notice, Role, Scene
+
+
+@dataclass(frozen=True)
+class VplSet:
+    """The VPLs of all bounces, which depend on geometry and lights but not on the camera.
+
+    Attributes:
+        vpls: ``kernels.vpls.Vpls``: those on the sky first, then bounce after bounce.
+        sight: ``kernels.ism.Sight``, by which they see.
+        ends: Where each part ends: the sky, then each bounce.
+        env: ``kernels.environment.Environment``.
+        region: What was covered.
+        notices: What could not be done.
+    """
+
+    vpls: Any
+    sight: Any
+    ends: tuple[int, ...]
+    env: Any
+    region: Region
+    notices: tuple[Notice, ...]
+
+
+def make_vpls(launcher: Launcher, scene: Scene, device_scene: DeviceScene, plan: Plan) -> VplSet:
+    """Place VPLs on the sky, on what the lights light, and on what those light (sections 3.3, 3.6 and 3.7)."""
+    settings = plan.settings
+    region = lit_region(scene, device_scene, plan)
+    env = build_environment(launcher, scene.lights)
+    sky = settings.vpls_sky if env.levels else 0
+    further = max(0, settings.bounces - 1)
+    room = sky + (settings.vpls_count + further * settings.vpls_further if settings.bounces else 0)
+    single = settings.shadow_maps == "single"
+    if settings.visibility == "ray":
+        sight = ray_sight(launcher, single=single)
+    else:
+        with launcher.scope("ism"):
+            sight = new_isms(
+                launcher, room, size=settings.ism_size, bias=settings.ism_bias, region=region, single=single
+            )
+    vpls = new_vpls(launcher, room)
+    builder = _Builder(launcher, scene, device_scene, plan, region, vpls, sight)
+    with launcher.scope("vpls"):
+        builder.extend(choose_sky(launcher, env, vpls, 0, sky, seed=settings.seed), disc=False)
+    if settings.bounces:
+        builder.first_bounce()
+    for bounce in range(further):
+        builder.next_bounce(bounce + 2)
+    vpls.count = builder.ends[-1]
+    return VplSet(vpls, sight, tuple(builder.ends), env, region, tuple(builder.notices))
+
+
+class _Builder:
+    """Fills the VPL buffer part by part; each part gets its shadow maps before the next one needs them."""
+
+    def __init__(
+        self,
+        launcher: Launcher,
+        scene: Scene,
+        device_scene: DeviceScene,
+        plan: Plan,
+        region: Region,
+        vpls: Any,
+        sight: Any,
+    ) -> None:
+        self.launcher, self.scene, self.device_scene, self.plan = launcher, scene, device_scene, plan
+        self.region, self.vpls, self.sight = region, vpls, sight
+        self.ends: list[int] = []
+        self.notices: list[Notice] = []
+        self._points: SurfacePoints | None = None
+
+    @property
+    def points(self) -> SurfacePoints:
+        """The clouds, sampled when first asked for."""
+        if self._points is None:
+            settings = self.plan.settings
+            with self.launcher.scope("point cloud"):
+                self._points = sample_surfaces(
+                    self.launcher,
+                    self.device_scene,
+                    self.region,
+                    block=settings.ism_points,
+                    blocks=settings.ism_blocks,
+                    seed=settings.seed,
+                )
+        return self._points
+
+    def extend(self, made: int, *, disc: bool = True) -> None:
+        """Take ``made`` VPLs into the set: their discs and their shadow maps."""
+        start = self.ends[-1] if self.ends else 0
+        self.ends.append(start + made)
+        settings = self.plan.settings
+        if made and disc:
+            spread_vpls(self.launcher, self.vpls, start, made, scale=settings.vpls_clamp, region=self.region)
+        if made and not self.sight.rays:
+            points = self.points
+            with self.launcher.scope("ism"):
+                draw_isms(self.launcher, self.sight, self.vpls, points, start, made, grow=settings.ism_grow)
+
+    def first_bounce(self) -> None:
+        """VPLs on what the lights light directly."""
+        settings = self.plan.settings
+        with self.launcher.scope("rsm"):
+            maps = [
+                light_maps(
+                    self.launcher,
+                    self.device_scene,
+                    i,
+                    added=light.role == LightRole.ADDED,
+                    size=settings.vpls_map,
+                    region=self.region,
+                    focus=settings.vpls_focus,
+                    least=settings.vpls_least,
+                    single=settings.shadow_maps == "single",
+                    seed=settings.seed,
+                )
+                for i, light in enumerate(self.scene.lights)
+            ]
+        for light, found in zip(self.scene.lights, maps, strict=True):
+            if found.real.total + found.synthetic.total <= 0.0:
+                self.notices.append(Notice(light.path, "it lights nothing in reach: no virtual point lights are made of it"))
+        with self.launcher.scope("vpls"):
+            made = choose_vpls(
+                self.launcher,
+                maps,
+                self.vpls,
+                self.ends[-1],
+                settings.vpls_count,
+                reach=self.region.reach,
+                seed=settings.seed,
+            )
+        self.extend(made)
+
+    def next_bounce(self, bounce: int) -> None:
+        """VPLs on what those of the last bounce light."""
+        settings = self.plan.settings
+        source = (self.ends[-2], self.ends[-1] - self.ends[-2])
+        points = self.points
+        with self.launcher.scope("bounces"):
+            made = bounce_vpls(
+                self.launcher,
+                self.device_scene,
+                self.vpls,
+                points,
+                self.sight,
+                source,
+                self.ends[-1],
+                settings.vpls_further,
+                sources=settings.vpls_sources,
+                strongest=settings.vpls_slots == "strongest",
+                reach=self.region.reach,
+                seed=settings.seed + 7919 * bounce,
+            )
+        self.extend(made)
+
+
+def lit_region(scene: Scene, device_scene: DeviceScene, plan: Plan) -> Region:
+    """The sphere around the part of the scene that the plan's volumes cover, and the one around what is synthetic."""
+    box = plan.coarse or plan.fine
+    low, high = _bounds(scene, device_scene, None)
+    low = np.maximum(low, np.asarray(box.low))
+    high = np.minimum(high, np.asarray(box.low) + box.edge)
+    center, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(np.maximum(high - low, 0.0))) * 1.001
+    focus, focus_radius = center, radius
+    if scene.bounds(Role.SYNTHETIC) is not None:
+        low, high = _bounds(scene, device_scene, Role.SYNTHETIC)
+        focus, focus_radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+    reach = float(np.abs(device_scene.triangles_vs).max()) if len(device_scene.triangles_vs) else 1.0
+    floor = 1e-6 * max(reach, 1.0)
+    return Region(
+        (float(center[0]), float(center[1]), float(center[2])),
+        max(radius, floor),
+        plan.start + radius,
+        (float(focus[0]), float(focus[1]), float(focus[2])),
+        max(focus_radius, floor),
+        max(reach, 1.0),
+    )
+
+
+def _bounds(scene: Scene, device_scene: DeviceScene, role: Role | None) -> tuple[np.ndarray, np.ndarray]:
+    bounds = scene.bounds(role) or (np.zeros(3), np.ones(3))
+    low, high = ((b - device_scene.origin) * device_scene.scale for b in bounds)
+    return low, high
+
+
+def render(
+    launcher: Launcher, scene: Scene, device_scene: DeviceScene, lights: VplSet, plan: Plan, *, with_before: bool
+) -> Radiance:
+    """Shade what the camera sees in both solutions at once (eqs. 1-8): direct, VPLs, reflections, resolve.
+
+    Args:
+        with_before: Also render the real scene alone, to serve as the plate.
+    """
+    settings = plan.settings
+    with launcher.scope("gbuffer"):
+        buffer = render_gbuffer(
+            launcher,
+            device_scene,
+            plan.width,
+            plan.height,
+            edge_samples=settings.antialias,
+            behind=with_before,
+            seed=settings.seed,
+        )
+    light = launcher.zeros(buffer.count, wp.vec3)
+    before = launcher.zeros(buffer.count if with_before else 1, wp.vec3)
+    hidden_before = launcher.zeros(max(1, buffer.behind_count), wp.vec3)
+    if plan.changes or with_before:
+        shader = _Shader(launcher, scene, device_scene, lights, plan)
+        shader.shade(buffer.points, buffer.count, light, before, with_before, buffer)
+        if with_before:
+            spare = launcher.zeros(max(1, buffer.behind_count), wp.vec3)
+            shader.shade(buffer.behind, buffer.behind_count, spare, hidden_before, True, None)
+    with launcher.scope("resolve"):
+        return resolve(
+            launcher,
+            device_scene,
+            buffer,
+            lights.env,
+            light=light,
+            before=before,
+            behind_before=hidden_before,
+            with_before=with_before,
+        )
+
+
+@dataclass(frozen=True)
+class _Shader:
+    """Lights points: those of a picture, or real surfaces behind synthetic ones (``buffer`` is None)."""
+
+    launcher: Launcher
+    scene: Scene
+    device_scene: DeviceScene
+    lights: VplSet
+    plan: Plan
+
+    def shade(
+        self, points: Any, count: int, light: Any, before: Any, with_before: bool, buffer: GBuffer | None
+    ) -> None:
+        """Write the light of ``count`` points: after on synthetic ones, after - before on real ones, and before."""
+        launcher, plan, lights = self.launcher, self.plan, self.lights
+        with launcher.scope("direct"):
+            self._direct(points, count, light, before, with_before)
+        source = VplLight(self.device_scene, lights.vpls, lights.sight, plan.settings.vpls_tiles, with_before)
+        if lights.ends[-1] > 0:
+            with launcher.scope("vpl shading"):
+                irradiance = (
+                    light_picture(launcher, buffer, source)
+                    if buffer is not None
+                    else light_points(launcher, points, count, source)
+                )
+                shade_indirect(
+                    launcher,
+                    points,
+                    count,
+                    irradiance,
+                    alpha_max=plan.alpha_max,
+                    light=light,
+                    before=before,
+                    with_before=with_before,
+                )
+        if plan.glossy and (plan.settings.bounces or lights.env.levels):
+            with launcher.scope("glossy"):
+                self._glossy(source, points, count, light, before)
+
+    def _direct(self, points: Any, count: int, light: Any, before: Any, with_before: bool) -> None:
+        """Direct light of all but domes (eqs. 1-5)."""
+        direct = direct_settings(self.plan, self.lights.region, self.scene, with_before)
+        if self.plan.settings.shadow_maps == "single":
+            shade_direct_single(
+                self.launcher,
+                self.device_scene,
+                points,
+                count,
+                direct,
+                self.lights.sight,
+                self.lights.region.start,
+                light=light,
+                before=before,
+            )
+        else:
+            shade_direct(self.launcher, self.device_scene, points, count, direct, light=light, before=before)
+
+    def _glossy(self, source: VplLight, points: Any, count: int, light: Any, before: Any) -> None:
+        plan, settings = self.plan, self.plan.settings
+        glossy = specular.Glossy()
+        glossy.rays, glossy.light_samples, glossy.seed = settings.glossy_rays, settings.shadows_samples, settings.seed
+        glossy.alpha_max = plan.alpha_max
+        index, found = find_glossy(self.launcher, points, count, plan.alpha_max)
+        # What a reflection shows has made one bounce already: the last bounce's VPLs would be one too many.
+        shown = replace(source, vpls=first_vpls(source.vpls, self.lights.ends[max(0, len(self.lights.ends) - 2)]))
+        shade_glossy(self.launcher, shown, self.lights.env, points, index, found, glossy, out=light, before=before)
+
+
+def first_vpls(vpls: Any, count: int) -> Any:
+    """The first ``count`` of ``vpls``, on the same arrays."""
+    fewer = Vpls()
+    for name in Vpls.vars:
+        setattr(fewer, name, getattr(vpls, name))
+    fewer.count = count
+    return fewer
+
+
+def direct_settings(plan: Plan, region: Region, scene: Scene, with_before: bool) -> Any:
+    """``kernels.shading.Direct`` for exact shadow rays."""
+    settings = plan.settings
+    direct = shading.Direct()
+    direct.samples = settings.shadows_samples
+    direct.probes = min(settings.shadows_probes, settings.shadows_samples)
+    direct.glossy = settings.glossy_rays if plan.glossy and (settings.bounces or has_dome(scene.lights)) else 0
+    direct.alpha_max = plan.alpha_max
+    direct.with_before = int(with_before)
+    direct.seed = settings.seed
+    direct.center = wp.vec3(*region.focus)
+    direct.radius = region.focus_radius * 1.001 if scene.bounds(Role.SYNTHETIC) is not None else 0.0
+    return direct
+
+
+def has_dome(lights: tuple[Light, ...]) -> bool:
+    """Whether any light is a dome."""
+    return any(light.kind == LightKind.DOME for light in lights)

@@ -1,0 +1,206 @@
+"""Light of VPLs at shading points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_dvct.device_scene import DeviceScene
+from warp_dvct.kernels import vpl_bounces, vpl_shading
+from warp_dvct.launch import Launcher
+from warp_dvct.passes.gather import point_pixels
+from warp_dvct.passes.gbuffer import GBuffer, compact
+from warp_dvct.passes.point_cloud import SurfacePoints
+from warp_dvct.passes.vpls import LUMINANCE
+
+PLANE_TOLERANCE = 0.5  # distance off the tangent plane, in tiles, at which a neighbour counts 1/e
+NORMAL_SHARPNESS = 8.0  # exponent of the normals' cosine
+SYNTHETIC_SLOTS = 0.25  # share of the slots of a further bounce that synthetic surfaces get
+
+
+@dataclass(frozen=True)
+class VplLight:
+    """VPLs and how they see.
+
+    Attributes:
+        scene: What they light.
+        vpls: ``kernels.vpls.Vpls``. sight: ``kernels.ism.Sight``.
+        tiles: Edge of the interleaved tiles; 1 lights every pixel by every VPL.
+        with_before: Whether the radiance before is wanted, or only the difference of the two solutions.
+    """
+
+    scene: DeviceScene
+    vpls: Any
+    sight: Any
+    tiles: int
+    with_before: bool
+
+    def irradiance(
+        self, launcher: Launcher, points: Any, index: Any, count: int, *, stride: int = 1, width: int = 0
+    ) -> tuple[Any, Any]:
+        """Irradiance [W m^-2], before and after, at the points listed in ``index``: two vec3 ``[count]``.
+
+        Args:
+            stride: Use one VPL in so many. width: Of the picture, where points are the pixels of interleaved tiles.
+        """
+        before, after = (launcher.empty(max(1, count), wp.vec3) for _ in range(2))
+        launcher.launch(
+            vpl_shading._shade_vpls,
+            count,
+            [
+                points,
+                index,
+                self.scene.geometry,
+                self.vpls,
+                self.sight,
+                width,
+                self.tiles,
+                stride,
+                int(self.with_before),
+            ],
+            [before, after],
+        )
+        return before, after
+
+
+def light_picture(launcher: Launcher, buffer: GBuffer, light: VplLight) -> tuple[Any, Any]:
+    """Irradiance, before and after, at every shading point of a picture: two vec3 ``[buffer.count]``.
+
+    Pixels of a tile share the VPLs out and a merge that respects depth and normals collects them (Segovia et al. 2006,
+    "Non-interleaved Deferred Shading of Interleaved Sample Patterns"). Points without like neighbours get all VPLs.
+    """
+    pixels = buffer.width * buffer.height
+    if light.tiles == 1:
+        return light.irradiance(launcher, buffer.points, indices(launcher, buffer.count), buffer.count)
+    split = light.irradiance(
+        launcher, buffer.points, indices(launcher, pixels), pixels, stride=light.tiles**2, width=buffer.width
+    )
+    before, after = (launcher.zeros(buffer.count, wp.vec3) for _ in range(2))
+    missing = launcher.empty(buffer.count, wp.int32)
+    launcher.launch(
+        vpl_shading._merge_tiles,
+        buffer.count,
+        [
+            buffer.points,
+            point_pixels(launcher, buffer),
+            buffer.width,
+            buffer.height,
+            light.tiles,
+            PLANE_TOLERANCE,
+            NORMAL_SHARPNESS,
+            *split,
+        ],
+        [before, after, missing],
+    )
+    _, index, left = compact(launcher, missing)
+    rest = light.irradiance(launcher, buffer.points, index, left)
+    launcher.launch(vpl_shading._put, left, [index, *rest], [before, after])
+    return before, after
+
+
+def light_points(launcher: Launcher, points: Any, count: int, light: VplLight) -> tuple[Any, Any]:
+    """Irradiance at points that are no picture, each by one VPL in ``light.tiles``."""
+    return light.irradiance(launcher, points, indices(launcher, count), count, stride=light.tiles)
+
+
+def indices(launcher: Launcher, count: int) -> Any:
+    """0 … count - 1 on the device."""
+    return launcher.array(np.arange(max(1, count), dtype=np.int32), wp.int32)
+
+
+def shade_direct_single(
+    launcher: Launcher, scene: DeviceScene, points: Any, count: int, direct: Any, sight: Any, far: float, *, light: Any, before: Any
+) -> None:
+    """Direct light with the single shadow map of 2010, as rays from the light would draw it; written, not added."""
+    launcher.launch(
+        vpl_shading._shade_direct_single, count, [points, scene.geometry, scene.lights, direct, sight, far], [light, before]
+    )
+
+
+def shade_glossy(
+    launcher: Launcher,
+    light: VplLight,
+    env: Any,
+    points: Any,
+    index: Any,
+    count: int,
+    glossy: Any,
+    *,
+    out: Any,
+    before: Any,
+) -> None:
+    """Add the reflections in glossy surfaces, by rays, to ``out`` (and ``before``) at the points listed in ``index``."""
+    scene = light.scene
+    launcher.launch(
+        vpl_shading._shade_glossy,
+        count,
+        [
+            points,
+            index,
+            scene.geometry,
+            scene.materials,
+            scene.lights,
+            env,
+            light.vpls,
+            light.sight,
+            glossy,
+            int(light.with_before),
+        ],
+        [out, before],
+    )
+
+
+def bounce_vpls(
+    launcher: Launcher,
+    scene: DeviceScene,
+    vpls: Any,
+    points: SurfacePoints,
+    sight: Any,
+    source: tuple[int, int],
+    start: int,
+    count: int,
+    *,
+    sources: int,
+    strongest: bool,
+    reach: float,
+    seed: int,
+) -> int:
+    """Make the VPLs of a further bounce in ``count`` slots from ``start`` on.
+
+    Every point of the clouds is a candidate for one slot: it draws ``sources`` VPLs of the bounce before in proportion
+    to their flux and asks ``sight`` whether they see it. One candidate gets the slot with the flux of all.
+
+    Args:
+        source: First and number of the VPLs of the bounce before.
+        strongest: The strongest candidate gets the slot, as in the paper; else one drawn in proportion to its flux,
+            which keeps the light's distribution.
+    Returns:
+        How many were made: 0 where the bounce before carries no light.
+    """
+    flux = vpls.flux.numpy()[source[0] : source[0] + source[1]] @ LUMINANCE
+    if not flux.sum() > 0.0:
+        return 0
+    cdf = np.concatenate([[0.0], np.cumsum(flux) / flux.sum()])
+    cdf[-1] = 1.0
+    synthetic = 0
+    if points.synthetic.count:
+        synthetic = count if not points.real.count else max(1, round(SYNTHETIC_SLOTS * count)) if count > 1 else 0
+    made = 0
+    for cloud, share in ((points.real, count - synthetic), (points.synthetic, synthetic)):
+        if share == 0:
+            continue
+        slots = vpl_bounces.Slots()
+        slots.source_first, slots.source_count = source
+        slots.start, slots.count = start + made, share
+        slots.sources, slots.strongest = sources, int(strongest)
+        slots.seed, slots.reach = seed, reach
+        launcher.launch(
+            vpl_bounces._bounce_vpls,
+            share,
+            [scene.geometry, cloud, sight, slots, launcher.array(cdf.astype(np.float32), wp.float32), vpls],
+        )
+        made += share
+    return made
