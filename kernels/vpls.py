@@ -186,9 +186,7 @@ def _sky_importance(first: int, env: Environment, added: int, importance_out: wp
 
 
 @wp.kernel
-def _choose_sky(
-    first: int, env: Environment, chain: Chain, added: int, count: int, seed: int, start: int, vpls: Vpls
-):
+def _choose_sky(first: int, env: Environment, chain: Chain, added: int, count: int, seed: int, start: int, vpls: Vpls):
     """A VPL on the sphere of the environment: uniform in solid angle inside the texel that warping finds."""
     i = first + wp.tid()
     at = start + i

@@ -112,7 +112,7 @@ def make_plan(
     """Decide, on the host and before any kernel runs, what the picture needs.
 
     Args:
-        method: ``delta-cones`` or ``path-trace``.
+        method: ``delta-cones``, ``instant-radiosity`` or ``path-trace``.
         has_plate: Whether a plate will be given; without one the picture before is rendered as well.
     """
     synthetic = scene.bounds(Role.SYNTHETIC)
@@ -132,6 +132,10 @@ def make_plan(
     changes = synthetic is not None or added
     if method == "path-trace":
         passes = (PassPlan("path trace", True, f"{settings.samples} samples a pixel, {settings.bounces} bounces"),)
+    elif method == "instant-radiosity":
+        from warp_dvct.plan_instant_radiosity import plan_passes
+
+        passes = plan_passes(scene, settings, width * height, glossy, changes, has_plate)
     else:
         passes = _passes(scene, settings, width * height, fine, coarse, scale, origin, maps, glossy, changes, has_plate)
     return Plan(

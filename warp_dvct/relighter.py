@@ -14,16 +14,17 @@ from warp_dvct.device_scene import DeviceScene, camera_frame
 from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher
 from warp_dvct.layers import Layers, Radiance
-from warp_dvct.methods import delta_cone_tracing, path_tracing
+from warp_dvct.methods import delta_cone_tracing, instant_radiosity, path_tracing
 from warp_dvct.passes.composite import composite
 from warp_dvct.plan import Plan, make_plan
-from warp_dvct.scene import Scene
+from warp_dvct.scene import Notice, Scene
 from warp_dvct.settings import make_settings
 
-METHODS = ("delta-cones", "path-trace")
+METHODS = ("delta-cones", "instant-radiosity", "path-trace")
 DEFAULT_WIDTH = 960
 
 Progress = Callable[[str, float], None]
+Lit = delta_cone_tracing.LightField | instant_radiosity.VplSet  # what a method keeps between frames
 
 
 class Relighter:
@@ -31,7 +32,7 @@ class Relighter:
 
     Args:
         stage: Path of a USD stage, an open ``Usd.Stage``, or a ``Scene``.
-        method: ``delta-cones`` or ``path-trace`` (the truth).
+        method: ``delta-cones``, ``instant-radiosity`` or ``path-trace`` (the truth).
         quality: ``draft``, ``balanced`` or ``high``.
         settings: Single knobs by dotted name (``warp_dvct.settings``), over the quality's preset.
         camera: Prim path of the camera; needed where the stage has several.
@@ -77,7 +78,8 @@ class Relighter:
             "purposes": purposes,
         }
         self._size = (width, height)
-        self._kept: tuple[str, DeviceScene, delta_cone_tracing.LightField | None] | None = None
+        self._kept: tuple[str, DeviceScene, Lit | None] | None = None
+        self._method_notices: tuple[Notice, ...] = ()
         self.stats: dict[str, Any] = {}
         self.load_seconds = 0.0
         self.set_time(time)
@@ -104,7 +106,7 @@ class Relighter:
         """Render the current frame.
 
         Args:
-            plate: The photograph, linear float32 ``[height, width, 3]``; without one the rendered 'before' is the plate.
+            plate: The photograph, linear float32 ``[height, width, 3]``; without one the rendered 'before' is it.
             progress: Called with the pass's name and the share of the frame that is done.
         """
         if plate is not None and plate.shape != (self.height, self.width, 3):
@@ -117,6 +119,8 @@ class Relighter:
         self._plan(has_plate=plate is not None)
         if self.method == "path-trace":
             radiance = self._path_trace(report)
+        elif self.method == "instant-radiosity":
+            radiance = self._instant_radiosity(plate is None, report)
         else:
             radiance = self._delta_cones(plate is None, report)
         report("composite", 0.95)
@@ -131,7 +135,7 @@ class Relighter:
             "passes": dict(launcher.pass_seconds),
             "peak_bytes": launcher.peak_bytes,
             "plan": self.plan.to_dict(),
-            "notices": [str(n) for n in self.scene.notices],
+            "notices": [str(n) for n in (*self.scene.notices, *self._method_notices)],
         }
         return layers
 
@@ -176,12 +180,26 @@ class Relighter:
         device_scene = self._device_scene()
         assert self._kept is not None
         light_field = self._kept[2]
-        if light_field is None:
+        if not isinstance(light_field, delta_cone_tracing.LightField):
             light_field = delta_cone_tracing.light_volumes(self._launcher, self.scene, device_scene, self.plan)
             self._kept = (self._kept[0], self._kept[1], light_field)
         report("shading", 0.5)
         return delta_cone_tracing.render(
             self._launcher, self.scene, device_scene, light_field, self.plan, with_before=with_before
+        )
+
+    def _instant_radiosity(self, with_before: bool, report: Progress) -> Radiance:
+        report("virtual point lights", 0.0)
+        device_scene = self._device_scene()
+        assert self._kept is not None
+        lights = self._kept[2]
+        if not isinstance(lights, instant_radiosity.VplSet):
+            lights = instant_radiosity.make_vpls(self._launcher, self.scene, device_scene, self.plan)
+            self._kept = (self._kept[0], self._kept[1], lights)
+        self._method_notices = lights.notices
+        report("shading", 0.3)
+        return instant_radiosity.render(
+            self._launcher, self.scene, device_scene, lights, self.plan, with_before=with_before
         )
 
     def _path_trace(self, report: Progress) -> Radiance:

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-METHODS = ("delta-cones", "path-trace")
+METHODS = ("delta-cones", "instant-radiosity", "path-trace")
 QUALITIES = ("draft", "balanced", "high")
 PURPOSES = ("default", "render", "proxy", "guide")
 
@@ -37,7 +37,7 @@ _STAGE_OPTIONS = (
         type=click.Choice(METHODS),
         default="delta-cones",
         show_default=True,
-        help="delta-cones is the fast one; path-trace is the unbiased truth.",
+        help="delta-cones is the fast one; instant-radiosity takes virtual lights; path-trace is the unbiased truth.",
     ),
     click.option(
         "--quality", type=click.Choice(QUALITIES), default="balanced", show_default=True, help="Preset of the settings."

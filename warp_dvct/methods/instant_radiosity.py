@@ -157,7 +157,9 @@ class _Builder:
             ]
         for light, found in zip(self.scene.lights, maps, strict=True):
             if found.real.total + found.synthetic.total <= 0.0:
-                self.notices.append(Notice(light.path, "it lights nothing in reach: no virtual point lights are made of it"))
+                self.notices.append(
+                    Notice(light.path, "it lights nothing in reach: no virtual point lights are made of it")
+                )
         with self.launcher.scope("vpls"):
             made = choose_vpls(
                 self.launcher,
@@ -324,7 +326,7 @@ class _Shader:
         plan, settings = self.plan, self.plan.settings
         glossy = specular.Glossy()
         glossy.rays, glossy.light_samples, glossy.seed = settings.glossy_rays, settings.shadows_samples, settings.seed
-        glossy.alpha_max = plan.alpha_max
+        glossy.alpha_max, glossy.again = plan.alpha_max, int(settings.bounces > 0)
         index, found = find_glossy(self.launcher, points, count, plan.alpha_max)
         # What a reflection shows has made one bounce already: the last bounce's VPLs would be one too many.
         shown = replace(source, vpls=first_vpls(source.vpls, self.lights.ends[max(0, len(self.lights.ends) - 2)]))

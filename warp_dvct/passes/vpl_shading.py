@@ -112,11 +112,23 @@ def indices(launcher: Launcher, count: int) -> Any:
 
 
 def shade_direct_single(
-    launcher: Launcher, scene: DeviceScene, points: Any, count: int, direct: Any, sight: Any, far: float, *, light: Any, before: Any
+    launcher: Launcher,
+    scene: DeviceScene,
+    points: Any,
+    count: int,
+    direct: Any,
+    sight: Any,
+    far: float,
+    *,
+    light: Any,
+    before: Any,
 ) -> None:
     """Direct light with the single shadow map of 2010, as rays from the light would draw it; written, not added."""
     launcher.launch(
-        vpl_shading._shade_direct_single, count, [points, scene.geometry, scene.lights, direct, sight, far], [light, before]
+        vpl_shading._shade_direct_single,
+        count,
+        [points, scene.geometry, scene.lights, direct, sight, far],
+        [light, before],
     )
 
 
@@ -132,7 +144,7 @@ def shade_glossy(
     out: Any,
     before: Any,
 ) -> None:
-    """Add the reflections in glossy surfaces, by rays, to ``out`` (and ``before``) at the points listed in ``index``."""
+    """Add reflections in glossy surfaces, by rays, to ``out`` (and ``before``) at the points listed in ``index``."""
     scene = light.scene
     launcher.launch(
         vpl_shading._shade_glossy,

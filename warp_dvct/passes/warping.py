@@ -44,7 +44,7 @@ def build_importance(launcher: Launcher, values: Any, width: int, height: int) -
         raise ValueError(f"an importance of {width} x {height} does not fit {values.shape[0]} values")
     sizes = [(width, height)]
     while sizes[-1] != (1, 1):
-        sizes.append(tuple(-(-n // 2) for n in sizes[-1]))
+        sizes.append((-(-sizes[-1][0] // 2), -(-sizes[-1][1] // 2)))
     counts = [w * h for w, h in sizes]
     chain = Chain()
     chain.width, chain.height, chain.levels = width, height, len(sizes)

@@ -1,0 +1,396 @@
+"""Light of VPLs at shading points, once for both solutions; the merge of interleaved points; glossy reflections.
+
+Knecht et al. 2012, eqs. 1-8. r(p) and r(VPL) are roles, ir the flag ``hidden``, s_tr and s_tv the two answers of
+``kernels.ism``.
+"""
+
+import warp as wp
+
+from warp_dvct.kernels.environment import Environment, environment_radiance
+from warp_dvct.kernels.gbuffer import BACKGROUND, REAL, SYNTHETIC, Points, load_surface
+from warp_dvct.kernels.geometry import FAR, Geometry, trace_real, trace_synthetic
+from warp_dvct.kernels.ism import AFTER, ALL, CHANGE, RAY_END, Sight, map_sight, ray_sight
+from warp_dvct.kernels.lights import ADDED, DOME, Lights, sample_light
+from warp_dvct.kernels.materials import (
+    Materials,
+    Surface,
+    brdf_cos,
+    brdf_cos_specular,
+    hemispherical_albedo,
+    spawn_point,
+    surface_at,
+)
+from warp_dvct.kernels.sampling import INV_PI, sobol2, uniform1
+from warp_dvct.kernels.shading import Direct, reflected, vndf_pdf
+from warp_dvct.kernels.specular import Glossy, lights_along, reflect_visible
+from warp_dvct.kernels.vpls import SKY, Vpls
+
+wp.set_module_options({"enable_backward": False})
+
+NEAREST = wp.constant(1.0e-12)  # squared distance below which a VPL and a point are one
+TOO_FEW = wp.constant(0.7)  # share of the interleaved sets that a point needs from its neighbours
+GLOSSY_VPLS = wp.constant(8)  # VPLs that light the surface which a glossy ray meets
+
+
+@wp.struct
+class Pair:
+    """A quantity in the two solutions."""
+
+    before: wp.vec3
+    after: wp.vec3
+
+
+@wp.struct
+class Toward:
+    """A VPL as a point sees it: irradiance at the point per unit of the VPL's flux, before visibility."""
+
+    direction: wp.vec3
+    distance: wp.float32
+    form: wp.float32
+
+
+@wp.func
+def toward_vpl(vpls: Vpls, k: int, s: Surface, origin: wp.vec3) -> Toward:
+    """cos cos / (pi (d² + R²)): what a disc of radius R sends to a point on its axis; 1 / d² where R is 0."""
+    out = Toward()
+    if vpls.kind[k] == SKY:
+        out.direction = vpls.normal[k]
+        out.distance = FAR
+        if wp.dot(s.normal_g, out.direction) > 0.0:
+            out.form = wp.max(wp.dot(s.normal, out.direction), 0.0)
+        return out
+    d = vpls.position[k] - origin
+    d2 = wp.length_sq(d)
+    if d2 <= NEAREST:
+        return out
+    out.distance = wp.sqrt(d2)
+    out.direction = d / out.distance
+    leaving = -wp.dot(out.direction, vpls.normal[k])
+    arriving = wp.dot(out.direction, s.normal)
+    if leaving > 0.0 and arriving > 0.0 and wp.dot(out.direction, s.normal_g) > 0.0:
+        out.form = leaving * arriving * INV_PI / (d2 + vpls.spread[k] * vpls.spread[k])
+    return out
+
+
+@wp.func
+def vpl_irradiance(
+    geo: Geometry, vpls: Vpls, k: int, s: Surface, sight: Sight, want_before: int, want_after: int, only_change: int
+) -> Pair:
+    """Irradiance by one VPL in both solutions (eqs. 6-8).
+
+    ``only_change`` asks for nothing but after - before: where both are equal, both may be 0.
+    """
+    out = Pair()
+    out.before = wp.vec3(0.0, 0.0, 0.0)
+    out.after = wp.vec3(0.0, 0.0, 0.0)
+    in_before = want_before != 0 and vpls.real[k] != 0
+    in_after = want_after != 0 and vpls.hidden[k] == 0
+    if not in_before and not in_after:
+        return out
+    origin = s.position + s.normal_g * (2.0e-6 * s.reach)
+    toward = toward_vpl(vpls, k, s, origin)
+    if toward.form <= 0.0:
+        return out
+    light = vpls.flux[k] * toward.form
+    need = int(ALL)
+    if not in_before:
+        need = AFTER
+    elif in_after and only_change != 0:
+        need = CHANGE
+    open = wp.vec2(1.0, 1.0)
+    if sight.rays != 0:
+        ask_synthetic = wp.where(in_after, 1, 0)
+        open = ray_sight(geo, sight, origin, toward.direction, toward.distance * RAY_END, ask_synthetic, need)
+    else:
+        open = map_sight(vpls, k, sight, origin)
+    if need == CHANGE and open[1] > 0.0:
+        return out
+    if in_before:
+        out.before = light * open[0]
+    if in_after:
+        out.after = light * wp.min(open[0], open[1])
+    return out
+
+
+@wp.kernel
+def _shade_vpls(
+    first: int,
+    points: Points,
+    index_in: wp.array(dtype=wp.int32),
+    geo: Geometry,
+    vpls: Vpls,
+    sight: Sight,
+    width: int,
+    tiles: int,
+    stride: int,
+    with_before: int,
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+):
+    """Irradiance [W m^-2] of a point by every ``stride``-th VPL, times ``stride``.
+
+    With ``width`` the first VPL is that of the pixel's place in its ``tiles`` x ``tiles`` tile (the interleaved split
+    of Segovia et al. 2006); else it is hashed.
+    """
+    i = first + wp.tid()
+    j = index_in[i]
+    before = wp.vec3(0.0, 0.0, 0.0)
+    after = wp.vec3(0.0, 0.0, 0.0)
+    if j >= 0:
+        role = points.role[j]
+        if role != BACKGROUND:
+            s = load_surface(points, j)
+            k = int(uniform1(11, j, 0, 51) * float(stride))
+            if width > 0:
+                k = (j / width) % tiles * tiles + (j % width) % tiles
+            want_before = wp.where(role == REAL, 1, 0)
+            only_change = wp.where(with_before != 0, 0, 1)
+            while k < vpls.count:
+                light = vpl_irradiance(geo, vpls, k, s, sight, want_before, 1, only_change)
+                before += light.before
+                after += light.after
+                k += stride
+    before_out[i] = before * float(stride)
+    after_out[i] = after * float(stride)
+
+
+@wp.kernel
+def _merge_tiles(
+    first: int,
+    points: Points,
+    pixel_in: wp.array(dtype=wp.int32),
+    width: int,
+    height: int,
+    tiles: int,
+    plane: float,
+    sharpness: float,
+    before_in: wp.array(dtype=wp.vec3),
+    after_in: wp.array(dtype=wp.vec3),
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+    missing_out: wp.array(dtype=wp.int32),
+):
+    """Irradiance of every shading point from the pixels around: the mean over the ``tiles``² sets of VPLs.
+
+    Each set comes from the four pixels nearest that have it, by distance, plane and normal, so that every VPL counts
+    alike wherever neighbours are left out. ``missing_out`` is 1 where too many sets have no pixel on the same surface.
+    """
+    i = first + wp.tid()
+    role = points.role[i]
+    missing = int(0)
+    if role != BACKGROUND:
+        pixel = pixel_in[i]
+        px = pixel % width
+        py = pixel / width
+        position = points.position[i]
+        normal_g = points.normal_g[i]
+        normal = points.normal[i]
+        reach = wp.max(plane * float(tiles) * points.footprint[i], 1.0e-12)
+        before = wp.vec3(0.0, 0.0, 0.0)
+        after = wp.vec3(0.0, 0.0, 0.0)
+        found = float(0.0)
+        for set in range(tiles * tiles):
+            x0 = px - (px - set % tiles + tiles) % tiles
+            y0 = py - (py - set / tiles + tiles) % tiles
+            total = float(0.0)
+            sum_before = wp.vec3(0.0, 0.0, 0.0)
+            sum_after = wp.vec3(0.0, 0.0, 0.0)
+            for corner in range(4):
+                x = x0 + (corner % 2) * tiles
+                y = y0 + (corner / 2) * tiles
+                if x >= 0 and x < width and y >= 0 and y < height:
+                    j = y * width + x
+                    if points.role[j] == role:
+                        facing = wp.dot(normal, points.normal[j])
+                        if facing > 0.0:
+                            offset = points.position[j] - position
+                            gap = (
+                                wp.max(wp.abs(wp.dot(offset, normal_g)), wp.abs(wp.dot(offset, points.normal_g[j])))
+                                / reach
+                            )
+                            near_x = 1.0 - wp.abs(float(x - px)) / float(tiles)
+                            near_y = 1.0 - wp.abs(float(y - py)) / float(tiles)
+                            weight = near_x * near_y * wp.pow(facing, sharpness) * wp.exp(-gap * gap)
+                            total += weight
+                            sum_before += before_in[j] * weight
+                            sum_after += after_in[j] * weight
+            if total > 1.0e-4:
+                before += sum_before / total
+                after += sum_after / total
+                found += 1.0
+        if found >= TOO_FEW * float(tiles * tiles):
+            before_out[i] = before / found
+            after_out[i] = after / found
+        else:
+            missing = 1
+    missing_out[i] = missing
+
+
+@wp.kernel
+def _shade_direct_single(
+    first: int,
+    points: Points,
+    geo: Geometry,
+    lights: Lights,
+    direct: Direct,
+    sight: Sight,
+    far: float,
+    light_out: wp.array(dtype=wp.vec3),
+    before_out: wp.array(dtype=wp.vec3),
+):
+    """Direct light as of 2010: one shadow map per light, which knows the surface nearest to the light alone.
+
+    Where that is synthetic, a real blocker behind it goes unseen: the light counts as lost, though the plate never had
+    it (double shadows). ``far`` is beyond all surfaces: lights without a place look from there.
+    """
+    i = first + wp.tid()
+    role = points.role[i]
+    light_out[i] = wp.vec3(0.0, 0.0, 0.0)
+    if direct.with_before != 0:
+        before_out[i] = wp.vec3(0.0, 0.0, 0.0)
+    if role == BACKGROUND:
+        return
+    s = load_surface(points, i)
+    wo = points.view[i]
+    before = wp.vec3(0.0, 0.0, 0.0)
+    after = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(lights.count):
+        if lights.kind[k] != DOME:
+            for j in range(direct.samples):
+                light = sample_light(lights, k, s.position, sobol2(direct.seed, i, j, 2 * k + 3))
+                f = reflected(s, wo, light, direct) / float(direct.samples)
+                if wp.max(f[0], wp.max(f[1], f[2])) > 0.0:
+                    reach = wp.min(light.distance, far) * RAY_END
+                    open = ray_sight(geo, sight, spawn_point(s, light.direction), light.direction, reach, 1, ALL)
+                    if role == REAL and lights.role[k] != ADDED:
+                        before += f * open[0]
+                    after += f * wp.min(open[0], open[1])
+    light_out[i] = after - before
+    if direct.with_before != 0:
+        before_out[i] = before
+
+
+@wp.func
+def lit_surface(
+    geo: Geometry,
+    lights: Lights,
+    vpls: Vpls,
+    sight: Sight,
+    s: Surface,
+    wo: wp.vec3,
+    want_before: int,
+    want_after: int,
+    seed: int,
+    index: int,
+    sample: int,
+) -> Pair:
+    """Radiance that a surface met by a glossy ray sends back: one sample of each light, and a few of the VPLs."""
+    out = Pair()
+    out.before = wp.vec3(0.0, 0.0, 0.0)
+    out.after = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(lights.count):
+        if lights.kind[k] != DOME:
+            light = sample_light(lights, k, s.position, sobol2(seed, index, sample, 60 + k))
+            f = wp.cw_mul(brdf_cos(s, wo, light.direction), light.value)
+            if wp.max(f[0], wp.max(f[1], f[2])) > 0.0:
+                reach = light.distance * RAY_END
+                exact = sight
+                exact.single = 0
+                open = ray_sight(geo, exact, spawn_point(s, light.direction), light.direction, reach, 1, ALL)
+                if want_before != 0 and lights.role[k] != ADDED:
+                    out.before += f * open[0]
+                if want_after != 0:
+                    out.after += f * wp.min(open[0], open[1])
+    if vpls.count > 0:
+        stride = wp.max(vpls.count / GLOSSY_VPLS, 1)
+        reflectance = hemispherical_albedo(s) * (INV_PI * float(stride))
+        j = int(uniform1(seed, index, sample, 59) * float(stride))
+        while j < vpls.count:
+            bounced = vpl_irradiance(geo, vpls, j, s, sight, want_before, want_after, 0)
+            out.before += wp.cw_mul(reflectance, bounced.before)
+            out.after += wp.cw_mul(reflectance, bounced.after)
+            j += stride
+    return out
+
+
+@wp.kernel
+def _shade_glossy(
+    first: int,
+    points: Points,
+    index_in: wp.array(dtype=wp.int32),
+    geo: Geometry,
+    mats: Materials,
+    lights: Lights,
+    env: Environment,
+    vpls: Vpls,
+    sight: Sight,
+    glossy: Glossy,
+    with_before: int,
+    light_out: wp.array(dtype=wp.vec3),
+    before_out: wp.array(dtype=wp.vec3),
+):
+    """Add the GGX lobe's reflections by rays with visible-normal sampling; VPLs would show as spots in it.
+
+    ``vpls`` are those that may light what a ray meets: one bounce less than light diffuse surfaces. ``glossy.again`` is
+    0 where surfaces are not to be seen at all: direct light only.
+    """
+    i = first + wp.tid()
+    j = index_in[i]
+    s = load_surface(points, j)
+    wo = points.view[j]
+    before = wp.vec3(0.0, 0.0, 0.0)
+    after = wp.vec3(0.0, 0.0, 0.0)
+    is_real = wp.where(points.role[j] == SYNTHETIC, 0, 1)
+    for k in range(glossy.rays):
+        direction = reflect_visible(s, wo, sobol2(glossy.seed, j, k, 17))
+        pdf = vndf_pdf(s, wo, direction)
+        if wp.dot(direction, s.normal_g) > 0.0 and pdf > 0.0:
+            weight = brdf_cos_specular(s, wo, direction) / pdf
+            density = pdf * float(glossy.rays)
+            samples = float(glossy.light_samples)
+            origin = spawn_point(s, direction)
+            real = trace_real(geo, origin, direction, FAR)
+            synthetic = trace_synthetic(geo, origin, direction, real.t)
+            share_after = wp.where(synthetic.found != 0, 0, 1)
+            seen = Pair()
+            seen.before = wp.vec3(0.0, 0.0, 0.0)
+            seen.after = wp.vec3(0.0, 0.0, 0.0)
+            if real.found != 0 and glossy.again != 0 and (share_after != 0 or is_real != 0):
+                met = surface_at(geo, mats, real, origin, direction)
+                seen = lit_surface(
+                    geo, lights, vpls, sight, met, -direction, is_real, share_after, glossy.seed, j, 2 * k
+                )
+            elif real.found == 0 and env.levels > 0:
+                seen.before = environment_radiance(env, direction, 1.0 / density, 0)
+                seen.after = environment_radiance(env, direction, 1.0 / density, 1)
+            if synthetic.found != 0:
+                seen.after = wp.vec3(0.0, 0.0, 0.0)
+            if synthetic.found != 0 and glossy.again != 0:
+                met = surface_at(geo, mats, synthetic, origin, direction)
+                inserted = lit_surface(geo, lights, vpls, sight, met, -direction, 0, 1, glossy.seed, j, 2 * k + 1)
+                seen.after = inserted.after
+            lamps = lights_along(lights, origin, direction, synthetic.t, density, samples, 1)
+            after += wp.cw_mul(weight, seen.after + lamps)
+            if is_real != 0:
+                lamps = lights_along(lights, origin, direction, real.t, density, samples, 0)
+                before += wp.cw_mul(weight, seen.before + lamps)
+    after = after / float(glossy.rays)
+    before = before / float(glossy.rays)
+    light_out[j] += after - before
+    if with_before != 0:
+        before_out[j] += before
+
+
+@wp.kernel
+def _put(
+    first: int,
+    index_in: wp.array(dtype=wp.int32),
+    before_in: wp.array(dtype=wp.vec3),
+    after_in: wp.array(dtype=wp.vec3),
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+):
+    """Write what was found at listed points where they are."""
+    i = first + wp.tid()
+    before_out[index_in[i]] = before_in[i]
+    after_out[index_in[i]] = after_in[i]
