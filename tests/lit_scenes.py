@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
+from warp_dvct.kernels import cones, shading
 from warp_dvct.kernels.volume import Volume, find_record
 from warp_dvct.launch import Launcher
 from warp_dvct.methods.delta_cone_tracing import _normals, _world
@@ -231,3 +232,27 @@ def points_on(
     positions = np.einsum("pk,pkx->px", weights, corners[pick])
     normals = _normals(device_scene.triangles_vs)[pick]
     return points_at(launcher, positions, normals, role=device_scene.role[pick]), pick
+
+
+def cone_settings(escape: str = "ray", **more: Any) -> Any:
+    """Cones as the method has them by default."""
+    settings = cones.ConeSettings()
+    settings.aperture, settings.step, settings.detail, settings.start = 0.0, 1.0, 0.5, 1.5
+    settings.reach, settings.additive, settings.split = 4.0, 1, cones.DUAL
+    settings.escape = int(escape == "ray")
+    for name, value in more.items():
+        setattr(settings, name, value)
+    return settings
+
+
+def direct_settings(scene: Scene, *, samples: int = 1, probes: int | None = None, with_before: bool = True) -> Any:
+    """Settings of the direct pass without a specular pass, with the bounding sphere of the synthetic objects."""
+    direct = shading.Direct()
+    direct.samples, direct.probes = samples, samples if probes is None else probes
+    direct.glossy, direct.alpha_max, direct.seed = 0, -1.0, 0
+    direct.with_before = int(with_before)
+    bounds = scene.bounds(Role.SYNTHETIC)
+    if bounds is not None:
+        direct.center = wp.vec3(*(0.5 * (bounds[0] + bounds[1])))
+        direct.radius = 0.5 * float(np.linalg.norm(bounds[1] - bounds[0])) * 1.001
+    return direct

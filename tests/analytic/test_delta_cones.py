@@ -7,24 +7,13 @@ from dataclasses import replace
 import lit_scenes as lit
 import numpy as np
 import pytest
+from lit_scenes import cone_settings as cone
 
-from warp_dvct.kernels import cones
 from warp_dvct.methods.path_tracing import gather_irradiance_reference
 from warp_dvct.passes.gather import Gatherer, gather_all
 from warp_dvct.passes.injection import empty_flux, inject
 from warp_dvct.passes.rsm import render_rsm
 from warp_dvct.scene import Light, LightKind, Material, Role, Scene
-
-
-def cone(escape="ray", **more):
-    """Settings as the method has them by default."""
-    settings = cones.ConeSettings()
-    settings.aperture, settings.step, settings.detail, settings.start = 0.0, 1.0, 0.5, 1.5
-    settings.reach, settings.additive, settings.split = 4.0, 1, cones.DUAL
-    settings.escape = int(escape == "ray")
-    for name, value in more.items():
-        setattr(settings, name, value)
-    return settings
 
 
 def gathered(launcher, points, count, gatherer) -> tuple[np.ndarray, np.ndarray]:
