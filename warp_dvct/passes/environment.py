@@ -53,7 +53,7 @@ def _power_of_two(width: int) -> int:
 
 
 def _resample(dome: Light, width: int) -> np.ndarray:
-    """The dome's radiance at the map's texel centres, float64 ``[width / 2, width, 3]``."""
+    """The dome's radiance at the map's texels, float64 ``[width / 2, width, 3]``."""
     radiance = np.asarray(dome.radiance, np.float64)
     if dome.texture is None:
         return np.broadcast_to(radiance, (width // 2, width, 3))
@@ -62,20 +62,33 @@ def _resample(dome: Light, width: int) -> np.ndarray:
     if factor > 1:  # average first, or a small bright sun falls between the samples
         h, w = (texture.shape[0] // factor) * factor, (texture.shape[1] // factor) * factor
         texture = texture[:h, :w].reshape(h // factor, factor, w // factor, factor, 3).mean((1, 3))
-    theta = (np.arange(width // 2) + 0.5) / (width // 2) * np.pi
-    phi = (0.5 - (np.arange(width) + 0.5) / width) * 2.0 * np.pi
-    sin = np.sin(theta)[:, None]
-    world = np.stack([sin * np.sin(phi), np.cos(theta)[:, None] * np.ones_like(phi), sin * np.cos(phi)], -1)
-    local = world @ np.asarray(dome.rotation, np.float64)
-    x = (0.5 - np.arctan2(local[..., 0], local[..., 2]) / (2 * np.pi)) * texture.shape[1] - 0.5
-    y = np.arccos(np.clip(local[..., 1], -1, 1)) / np.pi * texture.shape[0] - 0.5
+    rotation = np.asarray(dome.rotation, np.float64)
+    # About y the two grids agree. Otherwise a single sample per texel may miss a sun of one texel, or meet it twice.
+    places = (0.5,) if abs(rotation[1, 1]) > 1.0 - 1e-9 else (0.25, 0.75)
+    total, weight = np.zeros((width // 2, width, 3)), np.zeros((width // 2, 1, 1))
+    for y in places:
+        theta = (np.arange(width // 2) + y) / (width // 2) * np.pi
+        sin = np.sin(theta)[:, None]
+        for x in places:
+            phi = (0.5 - (np.arange(width) + x) / width) * 2.0 * np.pi
+            world = np.stack([sin * np.sin(phi), np.cos(theta)[:, None] * np.ones_like(phi), sin * np.cos(phi)], -1)
+            total += _look_up(texture, world @ rotation) * sin[..., None]
+            weight += sin[..., None]
+    return total / weight * radiance
+
+
+def _look_up(texture: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """A lat-long texture in unit directions of its own space: bilinear, periodic around, clamped at the poles."""
+    height, width = texture.shape[:2]
+    x = (0.5 - np.arctan2(direction[..., 0], direction[..., 2]) / (2 * np.pi)) * width - 0.5
+    y = np.arccos(np.clip(direction[..., 1], -1, 1)) / np.pi * height - 0.5
     x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
     fx, fy = (x - x0)[..., None], (y - y0)[..., None]
-    left, right = x0 % texture.shape[1], (x0 + 1) % texture.shape[1]
-    top, bottom = np.clip(y0, 0, len(texture) - 1), np.clip(y0 + 1, 0, len(texture) - 1)
+    left, right = x0 % width, (x0 + 1) % width
+    top, bottom = np.clip(y0, 0, height - 1), np.clip(y0 + 1, 0, height - 1)
     upper = texture[top, left] * (1 - fx) + texture[top, right] * fx
     lower = texture[bottom, left] * (1 - fx) + texture[bottom, right] * fx
-    return (upper * (1 - fy) + lower * fy) * radiance
+    return upper * (1 - fy) + lower * fy
 
 
 def _chain(image: np.ndarray) -> list[np.ndarray]:
