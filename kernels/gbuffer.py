@@ -202,6 +202,8 @@ def _see_behind(
     direction = -visible.view[j]
     spread = (cam.tan_right - cam.tan_left) / float(width)
     start = visible.position[j]
-    hit = trace_real(geo, start, direction, FAR)
-    hit.t += wp.dot(start - cam.origin, direction)
+    travelled = wp.dot(start - cam.origin, direction)
+    reach = wp.min(cam.far / wp.dot(direction, cam.forward), FAR) - travelled
+    hit = trace_real(geo, start, direction, reach)
+    hit.t += travelled
     store_hit(geo, mats, hit, cam.origin, direction, spread, i, points_out)
