@@ -32,6 +32,10 @@ from warp_dvct.kernels.shading import SHADOW_END, vndf_pdf
 wp.set_module_options({"enable_backward": False})
 
 
+# A GGX alpha from which on a lobe blurs what it shows by more than the voxels do: its rays read their radiosity.
+BLURRED = wp.constant(0.1)
+
+
 @wp.struct
 class Glossy:
     """Settings of the specular pass."""
@@ -181,6 +185,27 @@ def reflected_along(
     return result
 
 
+@wp.func
+def blurred_along(
+    geo: Geometry,
+    world: World,
+    lights: Lights,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    density: float,
+    glossy: Glossy,
+) -> Incident:
+    """As ``reflected_along``, from the voxels' radiosity where the ray ends."""
+    rays = density * float(glossy.rays)
+    light = ray_incident(world, geo, origin, direction, 1.0 / rays)
+    samples = float(glossy.light_samples)
+    light.before = light.before * INV_PI
+    light.after = light.after * INV_PI
+    light.before += lights_along(lights, origin, direction, light.distance_before, rays, samples, 0)
+    light.after += lights_along(lights, origin, direction, light.distance_after, rays, samples, 1)
+    return light
+
+
 @wp.kernel
 def _shade_specular_rays(
     first: int,
@@ -208,20 +233,14 @@ def _shade_specular_rays(
         density = vndf_pdf(s, wo, direction)
         if wp.dot(direction, s.normal_g) > 0.0 and density > 0.0:
             weight = brdf_cos_specular(s, wo, direction) / density
-            light = reflected_along(
-                geo,
-                mats,
-                world,
-                bounces,
-                lights,
-                spawn_point(s, direction),
-                direction,
-                density,
-                glossy,
-                1 - s.synthetic,
-                j,
-                k,
-            )
+            origin = spawn_point(s, direction)
+            light = Incident()
+            if s.alpha >= BLURRED:
+                light = blurred_along(geo, world, lights, origin, direction, density, glossy)
+            else:
+                light = reflected_along(
+                    geo, mats, world, bounces, lights, origin, direction, density, glossy, 1 - s.synthetic, j, k
+                )
             after += wp.cw_mul(weight, light.after)
             if s.synthetic == 0:
                 before += wp.cw_mul(weight, light.before)

@@ -44,7 +44,7 @@ class Settings:
     shadows_samples: int = _knob(16, "samples per light and shading point", low=1, high=4096)
 
     shadows_probes: int = _knob(
-        10, "samples traced first; the others are traced only where these disagree", low=1, high=4096
+        8, "samples traced first; the others are traced only where these disagree", low=1, high=4096
     )
 
     gather: str = _knob("rays", "how diffuse indirect light is gathered", choices=("rays", "cones"))
@@ -98,14 +98,14 @@ class Settings:
     ism_points: int = _knob(1024, "points per map", low=1, high=2**20)
     ism_blocks: int = _knob(16, "different sets of points that the maps share", low=1, high=4096)
     ism_grow: float = _knob(1.3, "radius of a splat, over that of the surface its point stands for", low=0.1, high=8.0)
-    ism_bias: float = _knob(0.03, "relative depth by which a blocker has to be nearer", low=0.0, high=1.0)
+    ism_bias: float = _knob(0.08, "relative depth by which a blocker has to be nearer", low=0.0, high=1.0)
 
     samples: int = _knob(64, "path-trace: samples per pixel", low=1, high=2**20)
 
 
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
-        "bounces": 2,
+        "bounces": 4,
         "volume.resolution": 96,
         "volume.coarse": 64,
         "rsm.texels": 192,
