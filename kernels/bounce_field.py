@@ -1,4 +1,4 @@
-"""Irradiance of the second and further bounces, on the patches of a coarse level: smooth, and free of sampling noise."""
+"""Irradiance of the second and further bounces, on the patches of a coarse level: smooth and without noise."""
 
 import warp as wp
 

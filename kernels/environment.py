@@ -19,7 +19,7 @@ class Environment:
 
 @wp.func
 def environment_radiance(env: Environment, direction: wp.vec3, solid_angle: float, solution: int) -> wp.vec3:
-    """Mean radiance over about ``solid_angle`` around a direction: bilinear in the level whose texels are that large."""
+    """Mean radiance over about ``solid_angle`` around a direction: bilinear in the level with texels that large."""
     if env.levels == 0:
         return wp.vec3(0.0, 0.0, 0.0)
     texel = 4.0 * PI / float(env.width * env.height)

@@ -327,7 +327,7 @@ def _shade_indirect(
     light_out: wp.array(dtype=wp.vec3),
     radiance_before_out: wp.array(dtype=wp.vec3),
 ):
-    """Add diffusely reflected indirect light: after on synthetic points (eq. 8), after - before on real ones (eq. 6)."""
+    """Add diffusely reflected indirect light: after on synthetic points (eq. 8), the change on real ones (eq. 6)."""
     i = first + wp.tid()
     role = points.role[i]
     if role != BACKGROUND:

@@ -26,7 +26,9 @@ wp.set_module_options({"enable_backward": False})
 RAY_END = wp.constant(0.9999)  # of the way to a VPL, whose own surface is not in its way
 STEEPEST = wp.constant(1.0e-3)  # cosine at which a splat is seen edge-on and left out
 WIDEST = wp.constant(3.0)  # largest angle from the map's axis that a splat's outline is followed to [rad]
-FILLED = wp.constant(0.49)  # share of covered texels from which a coarse texel fills the holes inside of it
+SKY_BIAS = wp.constant(0.5)  # of the bias is taken in orthographic maps, in radii of their region
+OVERHANG = wp.constant(3.0)  # distance in radii up to which the back of a splat is taken for an overhang
+FILLED = wp.constant(0.7)  # share of covered texels from which a coarse texel fills the holes inside of it
 # Which answers of a visibility test are needed.
 ALL = wp.constant(0)
 CHANGE = wp.constant(1)
@@ -71,6 +73,7 @@ class Ism:
     bias: wp.float32  # relative depth by which a blocker must be nearer than the receiver
     center: wp.vec3  # region of the orthographic maps
     radius: wp.float32
+    far: wp.float32  # height above the region's centre at which depth is 0 in them, in radii
     inverse: wp.array(dtype=wp.float32)
 
 
@@ -85,11 +88,12 @@ class Sight:
 
 @wp.struct
 class Place:
-    """Where a point falls in a VPL's map; ``depth`` is 0 where the map does not show it."""
+    """Where a point falls in a VPL's map, and the inverse depth of a blocker that is near enough to hide it; 0 where
+    the map does not show it."""
 
     x: wp.float32
     y: wp.float32
-    depth: wp.float32
+    limit: wp.float32
 
 
 @wp.func
@@ -100,15 +104,16 @@ def local_to(v: wp.vec3, axis: wp.vec3) -> wp.vec3:
 
 @wp.func
 def place_in_map(vpls: Vpls, k: int, ism: Ism, position: wp.vec3) -> Place:
-    """Continuous texel coordinates, and the depth that the map stores there."""
+    """Continuous texel coordinates, and what a blocker's inverse depth there has to exceed."""
     out = Place()
     half = 0.5 * float(ism.size)
     if vpls.kind[k] == SKY:
         p = local_to(position - ism.center, vpls.normal[k]) / ism.radius
-        if p[0] * p[0] + p[1] * p[1] < 1.0 and wp.abs(p[2]) < 1.0:
+        depth = ism.far - p[2] - SKY_BIAS * ism.bias
+        if wp.max(wp.abs(p[0]), wp.abs(p[1])) < 1.0 and depth > 0.0:
             out.x = (p[0] + 1.0) * half
             out.y = (p[1] + 1.0) * half
-            out.depth = 2.0 - p[2]
+            out.limit = 1.0 / depth
         return out
     v = local_to(position - vpls.position[k], vpls.normal[k])
     d = wp.length(v)
@@ -116,7 +121,7 @@ def place_in_map(vpls: Vpls, k: int, ism: Ism, position: wp.vec3) -> Place:
         scale = 1.0 / (d + v[2])
         out.x = (v[0] * scale + 1.0) * half
         out.y = (v[1] * scale + 1.0) * half
-        out.depth = d
+        out.limit = (1.0 + ism.bias) / d
     return out
 
 
@@ -219,9 +224,9 @@ def splat_flat(ism: Ism, start: int, v: wp.vec3, m: wp.vec3, radius: float):
             s = (float(x) + 0.5) / half - 1.0
             height = v[2] - ((s - v[0]) * m[0] + (t - v[1]) * m[1]) / m[2]
             d = wp.vec3(s, t, height) - v
-            if wp.length_sq(d) <= radius * radius and height < 1.5:
+            if wp.length_sq(d) <= radius * radius and height < ism.far:
                 at = start + y * ism.size + x
-                ism.inverse[at] = wp.max(ism.inverse[at], 1.0 / (2.0 - height))
+                ism.inverse[at] = wp.max(ism.inverse[at], 1.0 / (ism.far - height))
 
 
 @wp.kernel
@@ -245,7 +250,9 @@ def _splat_points(first: int, map_first: int, vpls: Vpls, real: Cloud, synthetic
             splat_flat(ism, start, v, m, radius / ism.radius)
         else:
             v = local_to(cloud.position[j] - vpls.position[k], axis)
-            if v[2] > -radius:
+            # A disc reaches beyond a convex edge. Where it hangs over the VPL its back shows, and it would hide all.
+            overhangs = wp.dot(v, m) > 0.0 and wp.length_sq(v) < OVERHANG * OVERHANG * radius * radius
+            if v[2] > -radius and not overhangs:
                 splat(ism, start, v, m, radius)
 
 
@@ -301,8 +308,12 @@ def map_texel(ism: Ism, start: int, x: int, y: int) -> float:
 
 
 @wp.func
-def nearest_inverse(ism: Ism, start: int, place: Place) -> float:
-    """Inverse depth in a map: interpolated over one surface, the nearest texel's across its edge."""
+def inverse_at(ism: Ism, start: int, place: Place) -> float:
+    """Inverse depth in a map: interpolated over one surface, the farthest of four texels across its edge.
+
+    Where a surface is seen at a grazing angle its depth falls from infinity to near within a texel; the farthest keeps
+    it from hiding itself.
+    """
     x = place.x - 0.5
     y = place.y - 0.5
     x0 = int(wp.floor(x))
@@ -317,9 +328,7 @@ def nearest_inverse(ism: Ism, start: int, place: Place) -> float:
     high = wp.max(wp.max(a, b), wp.max(c, d))
     if low >= high * SAME_SURFACE:
         return wp.lerp(wp.lerp(a, b, fx), wp.lerp(c, d, fx), fy)
-    upper = wp.where(fx < 0.5, a, b)
-    lower = wp.where(fx < 0.5, c, d)
-    return wp.where(fy < 0.5, upper, lower)
+    return low
 
 
 @wp.func
@@ -327,13 +336,12 @@ def map_sight(vpls: Vpls, k: int, sight: Sight, position: wp.vec3) -> wp.vec2:
     """1 or 0: whether VPL k sees a point past real surfaces (x), and past synthetic ones (y), by its two maps."""
     ism = sight.ism
     place = place_in_map(vpls, k, ism, position)
-    if place.depth <= 0.0:
+    if place.limit <= 0.0:
         return wp.vec2(1.0, 1.0)
-    limit = (1.0 + ism.bias) / place.depth
-    real = nearest_inverse(ism, 2 * k * ism.stride, place)
-    synthetic = nearest_inverse(ism, (2 * k + 1) * ism.stride, place)
-    s_real = wp.where(real > limit, 0.0, 1.0)
-    s_synthetic = wp.where(synthetic > limit, 0.0, 1.0)
+    real = inverse_at(ism, 2 * k * ism.stride, place)
+    synthetic = inverse_at(ism, (2 * k + 1) * ism.stride, place)
+    s_real = wp.where(real > place.limit, 0.0, 1.0)
+    s_synthetic = wp.where(synthetic > place.limit, 0.0, 1.0)
     if sight.single != 0 and s_synthetic == 0.0 and synthetic > real:
         s_real = 1.0  # one map shows the nearest blocker alone
     return wp.vec2(s_real, s_synthetic)

@@ -1,4 +1,4 @@
-"""Reflective shadow maps: every texel is a beam of known flux, followed to the first real and the first of all surfaces.
+"""Reflective shadow maps: every texel is a beam of known flux, followed to the first real surface and the first of all.
 
 The map's parametrisation follows the light: a cap or the whole sphere of directions (POINT, SPHERE, spots), a cap or
 the cosine-weighted hemisphere with origins spread over the area (RECT, DISK), parallel beams over a disc (DISTANT), and
@@ -128,7 +128,7 @@ def emit_parallel(lights: Lights, i: int, target: Target, texel: wp.vec2, xi: wp
 
 @wp.func
 def emit_beam(lights: Lights, i: int, target: Target, x: int, y: int, size: int, seed: int) -> Beam:
-    """Texel (x, y) of a ``size`` x ``size`` map: stratified in its direction (or place), low discrepancy in the rest."""
+    """Texel (x, y) of a ``size`` x ``size`` map: stratified in direction (or place), low discrepancy in the rest."""
     index = y * size + x
     jitter = uniform2(seed, index, i, 0)
     texel = wp.vec2((float(x) + jitter[0]) / float(size), (float(y) + jitter[1]) / float(size))

@@ -71,20 +71,6 @@ def find_record(volume: Volume, level: int, x: int, y: int, z: int) -> int:
 
 
 @wp.func
-def inside_volume(volume: Volume, position: wp.vec3) -> bool:
-    local = position - volume.low
-    edge = volume.voxel * float(volume.n)
-    return (
-        local[0] >= 0.0
-        and local[1] >= 0.0
-        and local[2] >= 0.0
-        and local[0] < edge
-        and local[1] < edge
-        and local[2] < edge
-    )
-
-
-@wp.func
 def face_of(axis: int, direction: float) -> int:
     """Face whose outward normal is along ``axis`` with the sign of ``direction``."""
     return wp.where(direction >= 0.0, 2 * axis, 2 * axis + 1)
@@ -95,32 +81,3 @@ def face_weight(normal: wp.vec3, face: int) -> float:
     """How much a surface of that normal shows on a face: max(0, n . e)."""
     along = normal[face / 2]
     return wp.max(0.0, wp.where((face & 1) == 0, along, -along))
-
-
-@wp.func
-def surface_field(volume: Volume, position: wp.vec3, normal: wp.vec3, solution: int) -> wp.vec4:
-    """Radiosity of the surface at a point: trilinear over level-0 voxels, faces weighted by the surface's normal.
-
-    Returns the weighted sums (radiosity * alpha, alpha); the radiosity is their ratio. All zero where no voxel near
-    holds a surface of that orientation.
-    """
-    local = (position - volume.low) / volume.voxel - wp.vec3(0.5, 0.5, 0.5)
-    x0 = int(wp.floor(local[0]))
-    y0 = int(wp.floor(local[1]))
-    z0 = int(wp.floor(local[2]))
-    fx = local[0] - float(x0)
-    fy = local[1] - float(y0)
-    fz = local[2] - float(z0)
-    total = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    for corner in range(8):
-        dx = corner & 1
-        dy = (corner >> 1) & 1
-        dz = corner >> 2
-        record = find_record(volume, 0, x0 + dx, y0 + dy, z0 + dz)
-        if record >= 0:
-            weight = wp.where(dx == 1, fx, 1.0 - fx) * wp.where(dy == 1, fy, 1.0 - fy) * wp.where(dz == 1, fz, 1.0 - fz)
-            for axis in range(3):
-                along = normal[axis]
-                face = face_of(axis, along)
-                total += (weight * wp.abs(along)) * volume.field[(record * 6 + face) * 2 + solution]
-    return total

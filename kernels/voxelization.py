@@ -157,9 +157,37 @@ def polygon_moments(polygon: Polygon) -> wp.vec4:
     return wp.vec4(moment[0], moment[1], moment[2], area)
 
 
+@wp.struct
+class Span:
+    """Cells to visit, both ends included."""
+
+    low: wp.vec3i
+    high: wp.vec3i
+
+
 @wp.func
 def first_index(low: float, size: int) -> int:
     return wp.clamp(int(wp.floor(low)), 0, size - 1)
+
+
+@wp.func
+def tile_span(triangle: Triangle, tiles: int) -> Span:
+    """Tiles that a triangle's bounds touch."""
+    span = Span()
+    for axis in range(3):
+        span.low[axis] = first_index(triangle.low[axis] / 8.0, tiles)
+        span.high[axis] = first_index(triangle.high[axis] / 8.0, tiles)
+    return span
+
+
+@wp.func
+def voxel_span(triangle: Triangle, start: wp.vec3i, n: int) -> Span:
+    """Voxels of the tile at ``start`` that a triangle's bounds touch."""
+    span = Span()
+    for axis in range(3):
+        span.low[axis] = wp.max(start[axis], first_index(triangle.low[axis], n))
+        span.high[axis] = wp.min(start[axis] + 7, first_index(triangle.high[axis], n))
+    return span
 
 
 @wp.kernel
@@ -182,11 +210,10 @@ def _count_tiles(
         if triangle.high[axis] < 0.0 or triangle.low[axis] > edge:
             outside = True
     if not outside:
-        for z in range(first_index(triangle.low[2] / 8.0, tiles), first_index(triangle.high[2] / 8.0, tiles) + 1):
-            for y in range(first_index(triangle.low[1] / 8.0, tiles), first_index(triangle.high[1] / 8.0, tiles) + 1):
-                for x in range(
-                    first_index(triangle.low[0] / 8.0, tiles), first_index(triangle.high[0] / 8.0, tiles) + 1
-                ):
+        span = tile_span(triangle, tiles)
+        for z in range(span.low[2], span.high[2] + 1):
+            for y in range(span.low[1], span.high[1] + 1):
+                for x in range(span.low[0], span.high[0] + 1):
                     if overlaps(triangle, wp.vec3(float(x), float(y), float(z)) * 8.0, 8.0):
                         count += 1
     count_out[i] = count
@@ -211,9 +238,10 @@ def _list_tiles(
     at = end_in[i] - count
     triangle = load_triangle(corners_in, i, low, voxel)
     tiles = brick_extent(n, 0)
-    for z in range(first_index(triangle.low[2] / 8.0, tiles), first_index(triangle.high[2] / 8.0, tiles) + 1):
-        for y in range(first_index(triangle.low[1] / 8.0, tiles), first_index(triangle.high[1] / 8.0, tiles) + 1):
-            for x in range(first_index(triangle.low[0] / 8.0, tiles), first_index(triangle.high[0] / 8.0, tiles) + 1):
+    span = tile_span(triangle, tiles)
+    for z in range(span.low[2], span.high[2] + 1):
+        for y in range(span.low[1], span.high[1] + 1):
+            for x in range(span.low[0], span.high[0] + 1):
                 if overlaps(triangle, wp.vec3(float(x), float(y), float(z)) * 8.0, 8.0):
                     tile_triangle_out[at] = i
                     tile_out[at] = (z * tiles + y) * tiles + x
@@ -242,17 +270,10 @@ def _count_fragments(
     triangle = load_triangle(corners_in, tile_triangle_in[i], low, voxel)
     start = tile_cell(tile_in[i], brick_extent(n, 0))
     count = int(0)
-    for z in range(
-        wp.max(start[2], first_index(triangle.low[2], n)), wp.min(start[2] + 7, first_index(triangle.high[2], n)) + 1
-    ):
-        for y in range(
-            wp.max(start[1], first_index(triangle.low[1], n)),
-            wp.min(start[1] + 7, first_index(triangle.high[1], n)) + 1,
-        ):
-            for x in range(
-                wp.max(start[0], first_index(triangle.low[0], n)),
-                wp.min(start[0] + 7, first_index(triangle.high[0], n)) + 1,
-            ):
+    span = voxel_span(triangle, start, n)
+    for z in range(span.low[2], span.high[2] + 1):
+        for y in range(span.low[1], span.high[1] + 1):
+            for x in range(span.low[0], span.high[0] + 1):
                 if overlaps(triangle, wp.vec3(float(x), float(y), float(z)), 1.0):
                     count += 1
     count_out[i] = count
@@ -275,7 +296,8 @@ def _cut_fragments(
 ):
     """Fragments of a triangle in a tile: centroid in volume space and area in voxel faces.
 
-    A triangle in the plane between two voxels is met by both; it belongs to the upper one, as cubes are half open. What was listed and not cut gets ``EMPTY_KEY``.
+    A triangle in the plane between two voxels is met by both; it belongs to the upper one, as cubes are half open. What
+    was listed and not cut gets ``EMPTY_KEY``.
     """
     i = first + wp.tid()
     at = end_in[i] - count_in[i]
@@ -283,17 +305,10 @@ def _cut_fragments(
     triangle = load_triangle(corners_in, index, low, voxel)
     bricks = brick_extent(n, 0)
     start = tile_cell(tile_in[i], bricks)
-    for z in range(
-        wp.max(start[2], first_index(triangle.low[2], n)), wp.min(start[2] + 7, first_index(triangle.high[2], n)) + 1
-    ):
-        for y in range(
-            wp.max(start[1], first_index(triangle.low[1], n)),
-            wp.min(start[1] + 7, first_index(triangle.high[1], n)) + 1,
-        ):
-            for x in range(
-                wp.max(start[0], first_index(triangle.low[0], n)),
-                wp.min(start[0] + 7, first_index(triangle.high[0], n)) + 1,
-            ):
+    span = voxel_span(triangle, start, n)
+    for z in range(span.low[2], span.high[2] + 1):
+        for y in range(span.low[1], span.high[1] + 1):
+            for x in range(span.low[0], span.high[0] + 1):
                 corner = wp.vec3(float(x), float(y), float(z))
                 if overlaps(triangle, corner, 1.0):
                     moments = polygon_moments(cut_triangle(triangle, corner))

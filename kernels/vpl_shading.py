@@ -394,3 +394,39 @@ def _put(
     i = first + wp.tid()
     before_out[index_in[i]] = before_in[i]
     after_out[index_in[i]] = after_in[i]
+
+
+@wp.kernel
+def _compare_sight(
+    first: int,
+    points: Points,
+    geo: Geometry,
+    vpls: Vpls,
+    maps: Sight,
+    rays: Sight,
+    pairs_out: wp.array(dtype=wp.vec4i),
+):
+    """Pairs of a point and a VPL that face each other: all, those in which maps and rays agree in both solutions as
+    far as the pair is in them, those that only maps find blocked in one, and those that only rays do."""
+    i = first + wp.tid()
+    total = wp.vec4i(0, 0, 0, 0)
+    if points.role[i] != BACKGROUND:
+        s = load_surface(points, i)
+        origin = s.position + s.normal_g * (2.0e-6 * s.reach)
+        for k in range(vpls.count):
+            toward = toward_vpl(vpls, k, s, origin)
+            if toward.form > 0.0:
+                a = map_sight(vpls, k, maps, origin)
+                b = ray_sight(geo, rays, origin, toward.direction, toward.distance * RAY_END, 1, ALL)
+                x = wp.vec2(a[0] * float(vpls.real[k]), wp.min(a[0], a[1]) * float(1 - vpls.hidden[k]))
+                y = wp.vec2(b[0] * float(vpls.real[k]), wp.min(b[0], b[1]) * float(1 - vpls.hidden[k]))
+                if points.role[i] != REAL:
+                    x[0] = 0.0
+                    y[0] = 0.0
+                total += wp.vec4i(
+                    1,
+                    wp.where(x == y, 1, 0),
+                    wp.where(x[0] < y[0] or x[1] < y[1], 1, 0),
+                    wp.where(x[0] > y[0] or x[1] > y[1], 1, 0),
+                )
+    pairs_out[i] = total

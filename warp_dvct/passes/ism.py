@@ -14,7 +14,8 @@ from warp_dvct.launch import Launcher
 from warp_dvct.passes.point_cloud import SurfacePoints
 from warp_dvct.passes.vpls import Region
 
-FILL_LEVELS = 3  # coarser levels that pull-push uses: it closes holes of up to 2**3 texels
+SKY_REGION = 4.0  # radius of what the maps of the sky show, over that of the synthetic objects
+FILL_LEVELS = 2
 
 
 def map_texels(size: int) -> int:
@@ -42,7 +43,9 @@ def new_isms(launcher: Launcher, count: int, *, size: int, bias: float, region: 
     ism = Ism()
     ism.size, ism.levels, ism.stride = size, _levels(size), map_texels(size)
     ism.bias = bias
-    ism.center, ism.radius = wp.vec3(*region.center), region.radius
+    # Maps of the sky show what is around the synthetic objects: farther off nothing changes by them.
+    ism.center, ism.radius = wp.vec3(*region.focus), min(region.radius, SKY_REGION * region.focus_radius)
+    ism.far = 1.0 + 2.0 * region.radius / ism.radius
     ism.inverse = launcher.zeros(max(1, 2 * count * ism.stride), wp.float32)
     return _sight(ism, rays=False, single=single)
 

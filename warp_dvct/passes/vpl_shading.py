@@ -216,3 +216,30 @@ def bounce_vpls(
         )
         made += share
     return made
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How imperfect shadow maps compare with exact rays over pairs of a point and a VPL that face each other.
+
+    Attributes:
+        pairs: How many were asked.
+        agree: Share in which both give the same answers, for real and for synthetic blockers.
+        only_maps, only_rays: Shares that only the maps, or only the rays, find blocked.
+    """
+
+    pairs: int
+    agree: float
+    only_maps: float
+    only_rays: float
+
+
+def compare_sight(
+    launcher: Launcher, scene: DeviceScene, points: Any, count: int, vpls: Any, maps: Any, rays: Any
+) -> Agreement:
+    """Ask both ``maps`` and ``rays`` for all pairs of ``count`` points and the VPLs."""
+    pairs = launcher.empty(max(1, count), wp.vec4i)
+    launcher.launch(vpl_shading._compare_sight, count, [points, scene.geometry, vpls, maps, rays], [pairs])
+    total, agree, only_maps, only_rays = (int(n) for n in pairs.numpy().sum(0, dtype=np.int64))
+    share = 1.0 / max(total, 1)
+    return Agreement(total, agree * share, only_maps * share, only_rays * share)
