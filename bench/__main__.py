@@ -1,4 +1,4 @@
-"""``python -m warp_dvct.bench error | table1``: see ``docs/benchmarks.md``."""
+"""``python -m warp_dvct.bench error | table1 | instant-radiosity``: see ``docs/benchmarks.md``."""
 
 from __future__ import annotations
 
@@ -85,6 +85,34 @@ def table1(quality: str, preset: bool, pairs: tuple[str, ...], json_file: Path |
     click.echo(module.format_table(times, title))
     if json_file is not None:
         write_json(json_file, {"title": title, "machine": module.machine(), "times": [asdict(t) for t in times]})
+
+
+@bench.command("instant-radiosity")
+@click.option("--stage", default="room_spot", show_default=True, help="A bundled stage or a USD file.")
+@click.option("--runs", type=int, default=3, show_default=True, help="Warm runs; the median is printed.")
+@click.option("--bounces", type=int, multiple=True, default=(1, 3), show_default=True, help="Repeatable.")
+@click.option("--sight/--no-sight", default=True, show_default=True, help="Also compare shadow maps with rays.")
+@_shared
+def instant_radiosity(stage: str, pairs: tuple[str, ...], json_file: Path | None, sight: bool, **rest: Any) -> None:
+    """Times of instant radiosity at the paper's size and settings, and how well its shadow maps see."""
+    start_warp(rest["device"])
+    from warp_dvct.bench import instant_radiosity as module
+    from warp_dvct.bench.error import read, stage_file
+    from warp_dvct.launch import Launcher
+
+    settings = settings_of(pairs)
+    times = module.measure(stage, settings=settings, **rest)
+    width, height = module.PAPER_SIZE
+    shown = " ".join(f"{k}={v}" for k, v in {**module.PAPER_SETTINGS, **settings}.items())
+    click.echo(module.format_times(times, f"{stage}, {width}x{height}, {shown}, median of {rest['runs']}"))
+    rows = []
+    if sight:
+        launcher = Launcher(rest["device"], rest["threads"])
+        rows = module.agreement(read(stage_file(stage)), module.POINTS, settings=settings, launcher=launcher)
+        click.echo("\n" + module.format_agreement(rows, f"{stage}: imperfect shadow maps against exact rays"))
+    if json_file is not None:
+        content = {"machine": module.machine(), "times": [asdict(t) for t in times], "sight": [asdict(r) for r in rows]}
+        write_json(json_file, content)
 
 
 def settings_of(pairs: tuple[str, ...]) -> dict[str, str]:
