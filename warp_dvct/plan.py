@@ -270,7 +270,13 @@ def _passes(
     indirect = lit and settings.bounces > 0
     dome = any(light.kind == LightKind.DOME for light in scene.lights)
     no_indirect = idle if not lit else "bounces=0 and no dome: direct light only"
-    needs_volume = indirect or (lit and settings.shadows == "cone") or (lit and glossy)
+    gathered = indirect or (lit and dome)
+    cones = (
+        (gathered and settings.gather == "cones")
+        or (lit and settings.shadows == "cone")
+        or (lit and glossy and settings.glossy == "cones")
+    )
+    needs_volume = indirect or cones or (lit and glossy)
     passes = [
         PassPlan("gbuffer", True, "what the camera sees", int(1.2 * pixels * POINT_BYTES)),
         PassPlan(
@@ -288,7 +294,6 @@ def _passes(
         biggest = max(m.size, m.coarse_size)
         passes.append(PassPlan(f"rsm {m.path}", indirect, why if indirect else no_indirect, biggest**2 * MAP_BYTES))
     more = indirect and settings.bounces > 1
-    cones = indirect and (settings.gather == "cones" or settings.shadows == "cone" or settings.glossy == "cones")
     passes += [
         PassPlan(
             "bounces",
@@ -307,8 +312,8 @@ def _passes(
         ),
         PassPlan(
             "gather",
-            indirect or (lit and dome),
-            f"{settings.gather} at 1 in {settings.gather_stride**2} pixels" if indirect or dome else no_indirect,
+            gathered,
+            f"{settings.gather} at 1 in {settings.gather_stride**2} pixels" if gathered else no_indirect,
             pixels * 48,
         ),
         PassPlan(

@@ -82,7 +82,7 @@ class Settings:
     vpls_further: int = _knob(128, "virtual point lights of each further bounce", low=1, high=2**17)
     vpls_sky: int = _knob(256, "virtual point lights on the sky, where there is a dome", low=1, high=2**17)
     vpls_map: int = _knob(256, "texels an edge of the maps that VPLs are drawn from", low=1, high=4096)
-    vpls_focus: float = _knob(0.5, "how much nearness to synthetic objects attracts VPLs", low=0.0, high=1.0)
+    vpls_focus: float = _knob(0.5, "share of VPLs that go by nearness to synthetic objects", low=0.0, high=1.0)
     vpls_least: float = _knob(
         0.15, "least share of VPLs on synthetic surfaces and on real ones behind; 0 by area", low=0.0, high=0.4
     )
@@ -171,7 +171,7 @@ def _convert(name: str, value: Any) -> Any:
     kind = type(knob.default)
     try:
         converted = kind(value) if not (kind is int and isinstance(value, float) and value != int(value)) else None
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         converted = None
     if converted is None:
         raise OptionError(f"{name}={value!r} is not {'a whole number' if kind is int else 'a number'}")

@@ -67,11 +67,12 @@ def light_volumes(launcher: Launcher, scene: Scene, device_scene: DeviceScene, p
         with launcher.scope("voxelize"):
             volumes = [_voxelize(launcher, device_scene, normals, b) for b in (plan.fine, plan.coarse) if b]
     world = _world(launcher, scene, normals, volumes)
-    if not volumes or settings.bounces == 0:
+    if not volumes:
         return LightField(world, tuple(volumes), bounce_field(launcher, None))
     fluxes = [empty_flux(launcher, v) for v in volumes]
     for voxels, flux in zip(volumes, fluxes, strict=True):
-        _inject_lights(launcher, device_scene, plan, voxels, flux)
+        if settings.bounces > 0:
+            _inject_lights(launcher, device_scene, plan, voxels, flux)
         with launcher.scope("light faces"):
             light_faces(launcher, voxels, flux, filter=settings.cones_filter)
     bounces = bounce_field(launcher, None)
