@@ -17,7 +17,12 @@ from warp_dvct.kernels.geometry import FAR, CameraFrame, Geometry
 from warp_dvct.kernels.lights import Lights
 from warp_dvct.kernels.materials import Materials
 from warp_dvct.launch import Launcher
+from warp_dvct.passes.sidedness import lit_from_behind
 from warp_dvct.scene import Camera, Light, LightKind, Material, Mesh, Role, Scene, Texture
+
+
+# A closed mesh may be met from behind by the odd ray that slips through an edge; this many are no accident.
+BACKS_MET = 4
 
 
 @dataclass(frozen=True)
@@ -28,7 +33,8 @@ class DeviceScene:
         geometry, materials, lights, camera: Kernel structs, in volume space.
         real, synthetic: The acceleration structures (``wp.Mesh``); None where there are no such triangles.
         triangles_vs: Host float32 ``[t, 3, 3]``, corners in volume space; real triangles first, then synthetic ones.
-        role, double_sided, material: Host int32 ``[t]``.
+        role, material: Host int32 ``[t]``.
+        double_sided: Host int32 ``[t]``: 1 where the stage says so, or where light meets the mesh from behind.
         origin: World position of volume space's origin, float64 ``[3]``, metres.
         scale: Volume-space units per metre.
     """
@@ -64,16 +70,21 @@ class DeviceScene:
         host = _HostTriangles.gather(scene, origin, scale)
         real = _build_mesh(launcher, host.triangles[: host.synthetic_first])
         synthetic = _build_mesh(launcher, host.triangles[host.synthetic_first :])
+        geometry = _upload_geometry(launcher, host, real, synthetic)
+        materials = _upload_materials(launcher, scene.materials, scene.textures)
+        lights = upload_lights(launcher, scene.lights, origin, scale)
+        double_sided = _both_sides(launcher, host, geometry, materials, lights)
+        geometry.double_sided = launcher.array(double_sided, wp.int32)
         return DeviceScene(
-            geometry=_upload_geometry(launcher, host, real, synthetic),
-            materials=_upload_materials(launcher, scene.materials, scene.textures),
-            lights=upload_lights(launcher, scene.lights, origin, scale),
+            geometry=geometry,
+            materials=materials,
+            lights=lights,
             camera=camera_frame(scene.camera, origin, scale),
             real=real,
             synthetic=synthetic,
             triangles_vs=host.triangles,
             role=host.role,
-            double_sided=host.double_sided,
+            double_sided=double_sided,
             material=host.material,
             origin=origin,
             scale=float(scale),
@@ -94,6 +105,7 @@ class _HostTriangles:
     material: np.ndarray
     double_sided: np.ndarray
     role: np.ndarray
+    mesh: np.ndarray
     synthetic_first: int
 
     @staticmethod
@@ -120,6 +132,7 @@ class _HostTriangles:
             material=each([m.materials for m in meshes]),
             double_sided=each([np.full(n, m.double_sided) for m, n in zip(meshes, counts, strict=True)]),
             role=each([np.full(n, m.role) for m, n in zip(meshes, counts, strict=True)]),
+            mesh=each([np.full(n, i) for i, n in enumerate(counts)]),
             synthetic_first=sum(n for m, n in zip(meshes, counts, strict=True) if m.role == Role.REAL),
         )
 
@@ -147,6 +160,17 @@ def _build_mesh(launcher: Launcher, triangles: np.ndarray) -> Any:
     points = launcher.array(triangles.reshape(-1, 3), wp.vec3)
     indices = launcher.array(np.arange(3 * len(triangles), dtype=np.int32), wp.int32)
     return wp.Mesh(points=points, indices=indices)
+
+
+def _both_sides(launcher: Launcher, host: _HostTriangles, geometry: Any, materials: Any, lights: Any) -> np.ndarray:
+    """Per triangle, whether the back shows as well: a mesh that light meets from behind shows it everywhere."""
+    if not len(host.triangles) or np.all(host.double_sided != 0):
+        return host.double_sided
+    low, high = host.triangles.min((0, 1)), host.triangles.max((0, 1))
+    center, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+    backs = lit_from_behind(launcher, geometry, materials, lights, center, radius)
+    met = np.bincount(host.mesh[backs], minlength=int(host.mesh[-1]) + 1)
+    return np.where(met[host.mesh] >= BACKS_MET, 1, host.double_sided).astype(np.int32)
 
 
 def _upload_geometry(launcher: Launcher, host: _HostTriangles, real: Any, synthetic: Any) -> Any:
