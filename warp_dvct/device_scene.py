@@ -20,7 +20,6 @@ from warp_dvct.launch import Launcher
 from warp_dvct.passes.sidedness import lit_from_behind
 from warp_dvct.scene import Camera, Light, LightKind, Material, Mesh, Role, Scene, Texture
 
-
 # A closed mesh may be met from behind by the odd ray that slips through an edge; this many are no accident.
 BACKS_MET = 4
 
