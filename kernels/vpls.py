@@ -53,16 +53,17 @@ class Maps:
 
 @wp.struct
 class Focus:
-    """Where VPLs matter most: a sphere around the synthetic objects, and how much that counts (0 … 1)."""
+    """Where VPLs matter most: a sphere around the synthetic objects; weights of all places alike, and of near ones."""
 
     center: wp.vec3
     radius: wp.float32
-    weight: wp.float32
+    everywhere: wp.float32
+    near: wp.float32
 
 
 @wp.func
 def importance_of(flux: wp.vec3, position: wp.vec3, normal: wp.vec3, focus: Focus) -> float:
-    """Flux x facing x distance: the share of a texel's light that can reach the focus; a part is for all else."""
+    """Flux x facing x distance: how much of a texel's light can reach the focus; and a part for all else."""
     toward = focus.center - position
     distance2 = wp.length_sq(toward)
     radius2 = focus.radius * focus.radius
@@ -70,7 +71,7 @@ def importance_of(flux: wp.vec3, position: wp.vec3, normal: wp.vec3, focus: Focu
     if distance2 <= radius2:
         facing = 1.0
     near = facing * radius2 / wp.max(radius2 + distance2, 1.0e-24)
-    return luminance(flux) * (1.0 - focus.weight + focus.weight * near)
+    return luminance(flux) * (focus.everywhere + focus.near * near)
 
 
 @wp.kernel

@@ -82,7 +82,7 @@ class Settings:
     vpls_further: int = _knob(128, "virtual point lights of each further bounce", low=1, high=2**17)
     vpls_sky: int = _knob(256, "virtual point lights on the sky, where there is a dome", low=1, high=2**17)
     vpls_map: int = _knob(256, "texels an edge of the maps that VPLs are drawn from", low=1, high=4096)
-    vpls_focus: float = _knob(0.5, "share of VPLs that go by nearness to synthetic objects", low=0.0, high=1.0)
+    vpls_focus: float = _knob(0.7, "share of VPLs that go by nearness to synthetic objects", low=0.0, high=1.0)
     vpls_least: float = _knob(
         0.15, "least share of VPLs on synthetic surfaces and on real ones behind; 0 by area", low=0.0, high=0.4
     )

@@ -84,7 +84,7 @@ def light_maps(
     Args:
         added: Whether the light is an added one: then all its surfaces go into one map.
         size: Texels an edge.
-        focus: How much nearness to the synthetic objects counts, 0 … 1.
+        focus: Share of the VPLs that go by nearness to the synthetic objects, 0 … 1; the others go by flux alone.
         least: Least share of VPLs on synthetic surfaces and on real ones behind them, where there are any; 0 is the
             paper's choice by covered pixels.
         single: The method of 2010: one map of the front-most surfaces, without VPL3.
@@ -94,10 +94,17 @@ def light_maps(
     )
     maps = _maps(rsm, added, single)
     look = kernels.Focus()
-    look.center, look.radius, look.weight = wp.vec3(*region.focus), region.focus_radius, focus
+    look.center, look.radius = wp.vec3(*region.focus), region.focus_radius
     count = size * size
     real, synthetic = (launcher.empty(count, wp.float32) for _ in range(2))
     hidden = launcher.empty(count, wp.int32)
+    sums = []
+    for look.everywhere, look.near in ((1.0, 0.0), (0.0, 1.0)):
+        launcher.launch(kernels._rsm_importance, count, [maps, look, 1.0], [real, synthetic, hidden])
+        sums.append(float(real.numpy().sum(dtype=np.float64) + synthetic.numpy().sum(dtype=np.float64)))
+    # A share ``focus`` of the VPLs follows the nearness, however small the part of the map that is near.
+    look.everywhere = 1.0 - focus if sums[1] > 0.0 else 1.0
+    look.near = focus * sums[0] / sums[1] if sums[1] > 0.0 else 0.0
     launcher.launch(kernels._rsm_importance, count, [maps, look, 1.0], [real, synthetic, hidden])
     gain = _hidden_gain(real.numpy(), hidden.numpy(), least)
     if gain != 1.0:
