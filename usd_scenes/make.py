@@ -17,6 +17,7 @@ SIDE, TOP, BACK, FRONT = 1.8, 2.2, -1.8, 2.2
 WHITE, RED, GREEN = (0.73, 0.73, 0.73), (0.63, 0.065, 0.05), (0.14, 0.45, 0.091)
 EYE, EYE_PITCH, EYE_ANGLE = (0.0, 1.25, 2.1), -14.0, 60.0
 SUN_ANGLE = 1.0  # degrees
+WALL = 0.001  # metres, the partition of thin_wall
 
 
 def stages() -> dict[str, str]:
@@ -28,6 +29,7 @@ def stages() -> dict[str, str]:
         "room_area": room_area(),
         "room_glossy": room_glossy(),
         "room_spot": room_spot(),
+        "thin_wall": thin_wall(),
     }
 
 
@@ -175,6 +177,42 @@ def bunny() -> str:
     return usda.stage(
         "bunny", "The Stanford bunny of warp-lang on a real table, lit from a window at the left.", children
     )
+
+
+def thin_wall() -> str:
+    """Two rooms with a wall of 1 mm between them, seen through the front wall; one is lit, the other is dark."""
+    over = 0.01  # how far the partition reaches into floor, ceiling and walls, so that no light passes by its edges
+    middle, high = 0.2, TOP + 2 * over
+    partition = usda.role(
+        "Partition",
+        "real",
+        [
+            usda.box(
+                "Board",
+                (WALL, high, middle - BACK + over),
+                (0, -over, (middle + BACK - over) / 2),
+                "White",
+            ),
+            usda.quad(
+                "Sheet", (0, -over, middle), (0, 0, FRONT + over - middle), (0, high, 0), "White", double_sided=True
+            ),
+        ],
+    )
+    lamp = usda.rect_light("Light", 0.6, 0.9, 16, usda.place((SIDE / 2, TOP - 0.01, 0.1), pitch=-90))
+    objects = [
+        usda.sphere("Ball", 0.22, (0.62, 0.22, 0.75), "White"),
+        usda.box("Crate", (0.36, 0.56, 0.36), (0.45, 0, -0.3), "Blue", turn=28),
+    ]
+    children = [
+        usda.camera("Camera", (-0.2, 1.15, 6), 0, -2, 48, near=4),
+        lamp,
+        room(),
+        partition,
+        usda.role("Synthetic", "synthetic", objects),
+        room_materials(),
+    ]
+    doc = "Two rooms, one lit and one dark, with a partition of 1 mm; a white ball and a blue crate in the lit one."
+    return usda.stage("thin_wall", doc, children)
 
 
 def room(floor: str = "White", furniture: str | None = None) -> str:

@@ -73,11 +73,12 @@ def mesh(
     material: str,
     xform: Sequence[str] = (),
     uvs: Sequence[tuple[float, float]] | None = None,
+    double_sided: bool = False,
 ) -> str:
-    """A one-sided polygon mesh without subdivision; ``uvs`` are per vertex."""
+    """A polygon mesh without subdivision, one-sided by default; ``uvs`` are per vertex."""
     low, high = ([pick(p[k] for p in points) for k in range(3)] for pick in (min, max))
     body = [
-        "uniform bool doubleSided = 0",
+        f"uniform bool doubleSided = {int(double_sided)}",
         f"float3[] extent = {array([vec(low), vec(high)])}",
         f"int[] faceVertexCounts = {array(str(len(f)) for f in faces)}",
         f"int[] faceVertexIndices = {array(str(i) for f in faces for i in f)}",
@@ -100,7 +101,15 @@ def box(name: str, size: Vec3, base: Vec3, material: str, turn: float = 0.0, inw
     return mesh(name, points, faces, material, place(base, turn))
 
 
-def quad(name: str, corner: Vec3, u: Vec3, v: Vec3, material: str, uv_repeat: float | None = None) -> str:
+def quad(
+    name: str,
+    corner: Vec3,
+    u: Vec3,
+    v: Vec3,
+    material: str,
+    uv_repeat: float | None = None,
+    double_sided: bool = False,
+) -> str:
     """A parallelogram whose front faces u x v; ``uv_repeat`` gives it texture coordinates 0 … uv_repeat."""
 
     def at(a: float, b: float) -> Vec3:
@@ -108,7 +117,8 @@ def quad(name: str, corner: Vec3, u: Vec3, v: Vec3, material: str, uv_repeat: fl
         return x, y, z
 
     uvs = None if uv_repeat is None else [(a * uv_repeat, b * uv_repeat) for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]
-    return mesh(name, [at(0, 0), at(1, 0), at(1, 1), at(0, 1)], [(0, 1, 2, 3)], material, uvs=uvs)
+    points = [at(0, 0), at(1, 0), at(1, 1), at(0, 1)]
+    return mesh(name, points, [(0, 1, 2, 3)], material, uvs=uvs, double_sided=double_sided)
 
 
 def sphere(name: str, radius: float, centre: Vec3, material: str) -> str:
@@ -208,11 +218,11 @@ def rect_light(name: str, width: float, height: float, intensity: float, xform: 
     return prim("RectLight", name, body)
 
 
-def camera(name: str, position: Vec3, turn: float, pitch: float, width_angle: float) -> str:
-    """A 16:9 camera with a horizontal field of view of ``width_angle`` degrees."""
+def camera(name: str, position: Vec3, turn: float, pitch: float, width_angle: float, near: float = 0.01) -> str:
+    """A 16:9 camera, ``width_angle`` degrees wide; what is nearer than ``near`` metres is cut away."""
     focal = 18 / math.tan(math.radians(width_angle) / 2)
     body = [
-        "float2 clippingRange = (0.01, 1000)",
+        f"float2 clippingRange = {vec((near, 1000))}",
         f"float focalLength = {number(focal)}",
         "float horizontalAperture = 36",
         "float verticalAperture = 20.25",

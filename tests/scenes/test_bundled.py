@@ -13,7 +13,7 @@ from warp_dvct import usd_scenes
 from warp_dvct.errors import FileError, OptionError
 from warp_dvct.usd_scenes import make
 
-STAGES = ["bunny", "furnace", "ground_dome", "room_area", "room_glossy", "room_spot"]
+STAGES = ["bunny", "furnace", "ground_dome", "room_area", "room_glossy", "room_spot", "thin_wall"]
 
 
 @pytest.fixture(autouse=True)
@@ -91,7 +91,7 @@ def test_dependencies_resolve(name):
     assert list(unresolved) == []
 
 
-@pytest.mark.parametrize("name", [n for n in STAGES if n.startswith("room") or n == "bunny"])
+@pytest.mark.parametrize("name", [n for n in STAGES if n.startswith("room") or n in ("bunny", "thin_wall")])
 def test_walls_face_inwards(name):
     """Each wall's normal points to the room's centre: a one-sided wall seen from behind would be missing."""
     stage = open_stage(name)
