@@ -46,13 +46,14 @@ test: $(VENV)/.test-installed
 	$(BIN)/python -m pytest
 
 # pyright sees links to the folders that only an installation maps into the package, and untyped stand-ins for what has
-# no types: the kernels, which are Warp's own language, and pxr.
+# no types (the kernels, which are Warp's own language, and pxr) or may be absent (what the extras bring).
+STAND_INS := pxr/__init__.py flip_evaluator.py mitsuba.py drjit.py oidn.py open3d.py
 lint: $(VENV)/.dev-installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	@rm -rf $(VENV)/typing && mkdir -p $(VENV)/typing/warp_dvct/kernels $(VENV)/typing/pxr
 	@ln -s ../../../bench ../../../usd_scenes $(VENV)/typing/warp_dvct/
-	@for f in pxr/__init__.py $$(ls kernels/*.py | sed 's,^,warp_dvct/,'); do \
+	@for f in $(STAND_INS) $$(ls kernels/*.py | sed 's,^,warp_dvct/,'); do \
 	  printf 'from typing import Any\n\ndef __getattr__(name: str) -> Any: ...\n' > $(VENV)/typing/$${f}i; done
 	$(BIN)/pyright
 	@big=$$(git ls-files -z 2>/dev/null | xargs -0 -r -I{} find {} -maxdepth 0 -size +$(MAX_BYTES)c 2>/dev/null); \

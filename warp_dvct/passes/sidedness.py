@@ -30,7 +30,7 @@ def lit_from_behind(
     target.radius = radius
     target.start = 2.0 * radius
     count = PROBE_SIZE * PROBE_SIZE
-    found = [np.zeros(0, np.int32)]
+    found: list[Any] = [np.zeros(0, np.int32)]
     for light in range(int(lights.count)):
         back = launcher.empty(count * PROBE_BOUNCES, wp.int32)
         launcher.launch(
