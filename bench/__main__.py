@@ -1,4 +1,4 @@
-"""``python -m warp_dvct.bench error | table1 | instant-radiosity``: see ``docs/benchmarks.md``."""
+"""``python -m warp_dvct.bench error | eq9 | table1 | instant-radiosity``: see ``docs/benchmarks.md``."""
 
 from __future__ import annotations
 
@@ -64,6 +64,31 @@ def error(
         click.echo(module.format_report(reports[-1]))
     if json_file is not None:
         write_json(json_file, {"options": asdict(options), "stages": [asdict(report) for report in reports]})
+
+
+@bench.command()
+@click.option("--stage", "stages", multiple=True, help="A bundled stage or a USD file; repeatable. Default: room_area.")
+@click.option("--quality", default="balanced", show_default=True)
+@click.option("--width", type=int, default=96, show_default=True, help="Pixels across; one point per pixel.")
+@_shared
+def eq9(stages: tuple[str, ...], pairs: tuple[str, ...], json_file: Path | None, **rest: Any) -> None:
+    """The paper's eq. 9: error of the delta formulation, for our cones and for the paper's."""
+    start_warp(rest["device"])
+    from warp_dvct.bench import delta_error as module
+    from warp_dvct.bench.error import read, stage_file
+    from warp_dvct.launch import Launcher
+
+    launcher = Launcher(rest["device"], rest["threads"])
+    measured = {}
+    for stage in stages or ("room_area",):
+        scene = read(stage_file(stage))
+        rows = module.delta_error(
+            launcher, scene, width=rest["width"], quality=rest["quality"], settings=settings_of(pairs)
+        )
+        measured[stage] = [asdict(row) for row in rows]
+        click.echo(module.format_rows(Path(stage).stem, rows))
+    if json_file is not None:
+        write_json(json_file, {"stages": measured})
 
 
 @bench.command()
