@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from warp_dvct.frame import VolumeFrame, volume_frame
 from warp_dvct.passes.voxels import Box, level_bricks
 from warp_dvct.scene import Light, LightKind, LightRole, Role, Scene
 from warp_dvct.settings import Settings
@@ -117,15 +118,10 @@ def make_plan(
     """
     synthetic = scene.bounds(Role.SYNTHETIC)
     added = any(light.role == LightRole.ADDED for light in scene.lights)
-    everything = scene.bounds() or (np.zeros(3), np.ones(3))
-    low, high = synthetic if synthetic is not None else everything
-    extent = float(np.max(everything[1] - everything[0])) or 1.0
-    edge = max(settings.volume_scale * float(np.max(high - low)), 1e-6 * extent)
-    center = 0.5 * (np.asarray(low) + np.asarray(high))
-    origin, scale = center - 0.5 * edge, 1.0 / edge
-    coarse = _coarse_box(everything, origin, scale, settings)
-    corners = (np.stack(everything) - origin) * scale
-    reach = float(np.linalg.norm(np.max(np.abs(corners - 0.5), 0)))
+    frame = volume_frame(scene, settings.volume_scale)
+    origin, scale = frame.origin, 1.0 / frame.edge
+    coarse = _coarse_box(frame, settings)
+    reach = float(np.linalg.norm(np.max(np.abs(np.stack([frame.low, frame.high]) - 0.5), 0)))
     fine = Box((0.0, 0.0, 0.0), 1.0, settings.volume_resolution)
     maps = tuple(_plan_map(i, x, origin, scale, fine, coarse, synthetic, settings) for i, x in enumerate(scene.lights))
     glossy = _is_glossy(scene, settings)
@@ -155,9 +151,9 @@ def make_plan(
     )
 
 
-def _coarse_box(everything: Any, origin: np.ndarray, scale: float, settings: Settings) -> Box | None:
+def _coarse_box(frame: VolumeFrame, settings: Settings) -> Box | None:
     """The cube around the scene, cut to ``volume.reach``; None where the fine volume holds everything."""
-    low, high = (np.stack(everything) - origin) * scale
+    low, high = frame.low, frame.high
     if settings.volume_coarse == 0 or (np.all(low >= 0.0) and np.all(high <= 1.0)):
         return None
     half = 0.5 * settings.volume_reach
