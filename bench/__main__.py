@@ -140,6 +140,53 @@ def instant_radiosity(stage: str, pairs: tuple[str, ...], json_file: Path | None
         write_json(json_file, content)
 
 
+@bench.command()
+@click.option("--stage", default="room_area", show_default=True, help="A bundled stage or a USD file.")
+@click.option("--width", type=int, default=320, show_default=True, help="Pixels; the height follows the camera.")
+@click.option("--spp", type=int, default=64, show_default=True, help="Samples per pixel of the truth.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Of the truth's random numbers.")
+@click.option("--cache", type=click.Path(path_type=Path), help="References; default: warp_dvct in the user's cache.")
+@_shared
+def curve(stage: str, spp: int, pairs: tuple[str, ...], json_file: Path | None, cache: Path | None, **rest: Any):
+    """Turn every knob up together: seconds, FLIP, error of the indirect delta, indirect energy."""
+    from warp_dvct.bench import sweep as module
+
+    _sweep(stage, module.CURVE, spp, pairs, json_file, cache, rest)
+
+
+@bench.command()
+@click.option("--stage", default="room_area", show_default=True, help="A bundled stage or a USD file.")
+@click.option(
+    "--try", "texts", multiple=True, required=True, metavar='"[LABEL:] KEY=VALUE ..."', help="Settings; repeatable."
+)
+@click.option("--method", default="delta-cones", show_default=True)
+@click.option("--quality", default="balanced", show_default=True)
+@click.option("--width", type=int, default=320, show_default=True, help="Pixels; the height follows the camera.")
+@click.option("--spp", type=int, default=64, show_default=True, help="Samples per pixel of the truth.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Of the truth's random numbers.")
+@click.option("--cache", type=click.Path(path_type=Path), help="References; default: warp_dvct in the user's cache.")
+@_shared
+def compare(stage: str, texts: tuple[str, ...], spp: int, pairs: tuple[str, ...], json_file, cache, **rest: Any):
+    """One stage under several settings, one line each: what a knob buys and what it costs."""
+    from warp_dvct.bench import sweep as module
+
+    _sweep(stage, module.parse_trials(texts), spp, pairs, json_file, cache, rest)
+
+
+def _sweep(stage: str, trials: Any, spp: int, pairs: tuple[str, ...], json_file: Path | None, cache, rest: Any) -> None:
+    start_warp(rest["device"])
+    from warp_dvct.bench import sweep as module
+
+    cache = cache or cache_folder() / "references"
+    options = module.SweepOptions(settings=settings_of(pairs), samples=spp, cache=cache, **rest)
+    click.echo(module.format_head(stage, options, list(trials)))
+    truth, done = module.measure(stage, trials, options, lambda t: click.echo(module.format_trial(t, list(trials))))
+    click.echo(f"the truth's own noise is FLIP {truth.noise:.4f}\n")
+    if json_file is not None:
+        content = {"options": asdict(options), "noise": truth.noise, "trials": [asdict(t) for t in done]}
+        write_json(json_file, content)
+
+
 def settings_of(pairs: tuple[str, ...]) -> dict[str, str]:
     """``key=value`` strings as a dict.
 
