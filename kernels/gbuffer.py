@@ -2,7 +2,16 @@
 
 import warp as wp
 
-from warp_dvct.kernels.geometry import FAR, CameraFrame, Geometry, Hit, camera_ray, trace_all, trace_real
+from warp_dvct.kernels.geometry import (
+    FAR,
+    CameraFrame,
+    Geometry,
+    Hit,
+    camera_ray,
+    trace_all,
+    trace_real,
+    trace_synthetic,
+)
 from warp_dvct.kernels.materials import Materials, Surface, surface_at
 from warp_dvct.kernels.sampling import sobol2
 
@@ -95,7 +104,7 @@ def see(
 
 
 @wp.kernel
-def _see_centers(
+def _see_real(
     first: int,
     geo: Geometry,
     mats: Materials,
@@ -103,9 +112,35 @@ def _see_centers(
     width: int,
     height: int,
     points_out: Points,
+    reach_out: wp.array(dtype=wp.float32),
 ):
+    """The real scene alone at the pixels' centres, and where each ray ends."""
     i = first + wp.tid()
-    see(geo, mats, cam, float(i % width) + 0.5, float(i / width) + 0.5, width, height, i, points_out)
+    ray = camera_ray(cam, float(i % width) + 0.5, float(i / width) + 0.5, width, height)
+    hit = trace_real(geo, ray.origin, ray.direction, ray.t_max)
+    spread = (cam.tan_right - cam.tan_left) / float(width)
+    store_hit(geo, mats, hit, ray.origin, ray.direction, spread, i, points_out)
+    reach_out[i] = hit.t
+
+
+@wp.kernel
+def _see_synthetic(
+    first: int,
+    geo: Geometry,
+    mats: Materials,
+    cam: CameraFrame,
+    reach_in: wp.array(dtype=wp.float32),
+    width: int,
+    height: int,
+    points_out: Points,
+):
+    """Synthetic surfaces in front of what ``points_out`` holds of the real scene."""
+    i = first + wp.tid()
+    ray = camera_ray(cam, float(i % width) + 0.5, float(i / width) + 0.5, width, height)
+    hit = trace_synthetic(geo, ray.origin, ray.direction, reach_in[i])
+    if hit.found != 0:
+        spread = (cam.tan_right - cam.tan_left) / float(width)
+        store_hit(geo, mats, hit, ray.origin, ray.direction, spread, i, points_out)
 
 
 @wp.func

@@ -9,7 +9,7 @@ flux, so the flux that arrives does not depend on the number of texels.
 import warp as wp
 
 from warp_dvct.kernels.geometry import FAR, Geometry, trace_real, trace_synthetic
-from warp_dvct.kernels.lights import ADDED, DISK, DISTANT, DOME, POINT, SPHERE, Lights, sample_dome, spot_factor
+from warp_dvct.kernels.lights import DISK, DISTANT, DOME, POINT, SPHERE, Lights, sample_dome, spot_factor
 from warp_dvct.kernels.materials import Materials, hemispherical_albedo, surface_at
 from warp_dvct.kernels.sampling import (
     PI,
@@ -146,7 +146,7 @@ def emit_beam(lights: Lights, i: int, target: Target, x: int, y: int, size: int,
 
 
 @wp.kernel
-def _render_rsm(
+def _render_real(
     first: int,
     geo: Geometry,
     mats: Materials,
@@ -155,44 +155,62 @@ def _render_rsm(
     light: int,
     size: int,
     seed: int,
-    position_after_out: wp.array(dtype=wp.vec3),
-    normal_after_out: wp.array(dtype=wp.vec3),
-    flux_after_out: wp.array(dtype=wp.vec3),
-    role_after_out: wp.array(dtype=wp.int32),
-    position_before_out: wp.array(dtype=wp.vec3),
-    normal_before_out: wp.array(dtype=wp.vec3),
-    flux_before_out: wp.array(dtype=wp.vec3),
-    role_before_out: wp.array(dtype=wp.int32),
+    reach_out: wp.array(dtype=wp.float32),
+    position_out: wp.array(dtype=wp.vec3),
+    normal_out: wp.array(dtype=wp.vec3),
+    flux_out: wp.array(dtype=wp.vec3),
+    role_out: wp.array(dtype=wp.int32),
 ):
-    """One texel of the pair: reflected flux where the beam first meets anything (after) and anything real (before).
+    """One texel: reflected flux where the beam first meets anything real; role 0, or -1 where it meets nothing.
 
-    Roles are 0 real, 1 synthetic, -1 nothing. Where both maps see the same real surface the values are equal; an
-    added light has no before.
+    ``reach_out`` is the beam's length.
     """
     i = first + wp.tid()
     beam = emit_beam(lights, light, target, i % size, i / size, size, seed)
-    real = trace_real(geo, beam.origin, beam.direction, FAR)
-    synthetic = trace_synthetic(geo, beam.origin, beam.direction, real.t)
-    role_before = int(-1)
-    role_after = int(-1)
-    if real.found != 0:
-        s = surface_at(geo, mats, real, beam.origin, beam.direction)
-        flux = wp.cw_mul(hemispherical_albedo(s), beam.flux)
-        if lights.role[light] != ADDED:
-            role_before = 0
-            position_before_out[i] = s.position
-            normal_before_out[i] = s.normal_g
-            flux_before_out[i] = flux
-        if synthetic.found == 0:
-            role_after = 0
-            position_after_out[i] = s.position
-            normal_after_out[i] = s.normal_g
-            flux_after_out[i] = flux
-    if synthetic.found != 0:
-        s = surface_at(geo, mats, synthetic, beam.origin, beam.direction)
-        role_after = 1
-        position_after_out[i] = s.position
-        normal_after_out[i] = s.normal_g
-        flux_after_out[i] = wp.cw_mul(hemispherical_albedo(s), beam.flux)
-    role_after_out[i] = role_after
-    role_before_out[i] = role_before
+    hit = trace_real(geo, beam.origin, beam.direction, FAR)
+    reach_out[i] = hit.t
+    role_out[i] = -1
+    if hit.found != 0:
+        s = surface_at(geo, mats, hit, beam.origin, beam.direction)
+        role_out[i] = 0
+        position_out[i] = s.position
+        normal_out[i] = s.normal_g
+        flux_out[i] = wp.cw_mul(hemispherical_albedo(s), beam.flux)
+
+
+@wp.kernel
+def _render_after(
+    first: int,
+    geo: Geometry,
+    mats: Materials,
+    lights: Lights,
+    target: Target,
+    light: int,
+    size: int,
+    seed: int,
+    reach_in: wp.array(dtype=wp.float32),
+    position_in: wp.array(dtype=wp.vec3),
+    normal_in: wp.array(dtype=wp.vec3),
+    flux_in: wp.array(dtype=wp.vec3),
+    role_in: wp.array(dtype=wp.int32),
+    position_out: wp.array(dtype=wp.vec3),
+    normal_out: wp.array(dtype=wp.vec3),
+    flux_out: wp.array(dtype=wp.vec3),
+    role_out: wp.array(dtype=wp.int32),
+):
+    """One texel: reflected flux where the beam first meets anything; role 1 where that is synthetic."""
+    i = first + wp.tid()
+    beam = emit_beam(lights, light, target, i % size, i / size, size, seed)
+    hit = trace_synthetic(geo, beam.origin, beam.direction, reach_in[i])
+    role = role_in[i]
+    if hit.found != 0:
+        s = surface_at(geo, mats, hit, beam.origin, beam.direction)
+        role = 1
+        position_out[i] = s.position
+        normal_out[i] = s.normal_g
+        flux_out[i] = wp.cw_mul(hemispherical_albedo(s), beam.flux)
+    elif role >= 0:
+        position_out[i] = position_in[i]
+        normal_out[i] = normal_in[i]
+        flux_out[i] = flux_in[i]
+    role_out[i] = role

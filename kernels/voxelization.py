@@ -330,6 +330,54 @@ def _cut_fragments(
 
 
 @wp.kernel
+def _sort_fragments(
+    first: int,
+    order_in: wp.array(dtype=wp.int32),
+    key_in: wp.array(dtype=wp.int32),
+    triangle_in: wp.array(dtype=wp.int32),
+    fragment_in: wp.array(dtype=wp.vec4),
+    key_out: wp.array(dtype=wp.int32),
+    triangle_out: wp.array(dtype=wp.int32),
+    fragment_out: wp.array(dtype=wp.vec4),
+):
+    i = first + wp.tid()
+    key_out[i] = key_in[i]
+    triangle_out[i] = triangle_in[order_in[i]]
+    fragment_out[i] = fragment_in[order_in[i]]
+
+
+@wp.kernel
+def _join_fragments(
+    first: int,
+    key_in: wp.array(dtype=wp.int32),
+    triangle_in: wp.array(dtype=wp.int32),
+    fragment_in: wp.array(dtype=wp.vec4),
+    other_key_in: wp.array(dtype=wp.int32),
+    others: int,
+    ties: int,
+    triangle_first: int,
+    key_out: wp.array(dtype=wp.int32),
+    triangle_out: wp.array(dtype=wp.int32),
+    fragment_out: wp.array(dtype=wp.vec4),
+):
+    """Put one of two sorted lists where it belongs in their union; ``ties`` is 1 where equal keys of the other list
+    come first."""
+    i = first + wp.tid()
+    key = key_in[i]
+    low = int(0)
+    high = int(others)
+    while low < high:
+        middle = (low + high) / 2
+        if other_key_in[middle] < key + ties:
+            low = middle + 1
+        else:
+            high = middle
+    key_out[i + low] = key
+    triangle_out[i + low] = triangle_in[i] + triangle_first
+    fragment_out[i + low] = fragment_in[i]
+
+
+@wp.kernel
 def _mark_starts(first: int, key_in: wp.array(dtype=wp.int32), shift: int, start_out: wp.array(dtype=wp.int32)):
     """1 where a sorted key, less its ``shift`` lowest bits, differs from the one before it; 0 for EMPTY_KEY."""
     i = first + wp.tid()

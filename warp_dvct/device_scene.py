@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from warp_dvct.errors import StageError
+from warp_dvct.kept import Kept
 from warp_dvct.kernels.geometry import FAR, CameraFrame, Geometry
 from warp_dvct.kernels.lights import Lights
 from warp_dvct.kernels.materials import Materials
@@ -52,12 +53,15 @@ class DeviceScene:
     scale: float
 
     @staticmethod
-    def upload(launcher: Launcher, scene: Scene, origin: np.ndarray, scale: float) -> DeviceScene:
+    def upload(
+        launcher: Launcher, scene: Scene, origin: np.ndarray, scale: float, kept: Kept | None = None
+    ) -> DeviceScene:
         """Move a scene into volume space and onto the launcher's device.
 
         Args:
             origin: World position that becomes (0, 0, 0), shape ``[3]``, metres.
             scale: Volume-space units per metre, positive.
+            kept: Holds the real scene's part from frame to frame.
         Raises:
             ValueError: ``scale`` is not positive and finite.
             StageError: A triangle refers to a point or material that does not exist.
@@ -67,7 +71,8 @@ class DeviceScene:
             raise ValueError(f"scale is {scale}; it must be positive and finite")
         _check_indices(scene)
         host = _HostTriangles.gather(scene, origin, scale)
-        real = _build_mesh(launcher, host.triangles[: host.synthetic_first])
+        kept = kept or Kept()
+        real = kept.get("real triangles", None, lambda: _build_mesh(launcher, host.triangles[: host.synthetic_first]))
         synthetic = _build_mesh(launcher, host.triangles[host.synthetic_first :])
         geometry = _upload_geometry(launcher, host, real, synthetic)
         materials = _upload_materials(launcher, scene.materials, scene.textures)

@@ -17,6 +17,7 @@ from warp_dvct.scene import Role, Scene
 
 STEPS_PER_OCTAVE = 4  # of the fine volume's edge: it is within 2**(1/8), 9 %, of what volume.scale asks for
 STEPS_PER_EDGE = 8  # of the fine volume's centre: it is within a sixteenth of the edge from the objects' middle
+ALMOST = 0.05  # of a step: objects may stand out of the real scene that far, less than the coarse volume's margin
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,11 @@ def volume_frame(scene: Scene, volume_scale: float) -> VolumeFrame:
     origin = real[0] + np.round((center - real[0]) / grid) * grid - 0.5 * edge
     outer = np.floor((low - origin) / grid) / STEPS_PER_EDGE, np.ceil((high - origin) / grid) / STEPS_PER_EDGE
     inner = (real[0] - origin) / edge, (real[1] - origin) / edge
-    # Where the objects are inside of the real scene's bounds, their motion does not show at all.
+    # Where the objects are inside of the real scene's bounds, or all but inside, their motion does not show at all.
+    slack = ALMOST * grid
     return VolumeFrame(
         origin,
         edge,
-        np.where(low < real[0], np.minimum(inner[0], outer[0]), inner[0]),
-        np.where(high > real[1], np.maximum(inner[1], outer[1]), inner[1]),
+        np.where(low < real[0] - slack, np.minimum(inner[0], outer[0]), inner[0]),
+        np.where(high > real[1] + slack, np.maximum(inner[1], outer[1]), inner[1]),
     )

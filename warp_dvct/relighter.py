@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-import hashlib
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from warp_dvct.device_scene import DeviceScene, camera_frame
 from warp_dvct.errors import OptionError
+from warp_dvct.kept import Kept, content_key
 from warp_dvct.launch import Launcher
 from warp_dvct.layers import Layers, Radiance
 from warp_dvct.methods import delta_cone_tracing, instant_radiosity, path_tracing
 from warp_dvct.passes.composite import composite
 from warp_dvct.plan import Plan, make_plan
-from warp_dvct.scene import Notice, Scene
+from warp_dvct.scene import Notice, Role, Scene
 from warp_dvct.settings import make_settings
 
 METHODS = ("delta-cones", "instant-radiosity", "path-trace")
 DEFAULT_WIDTH = 960
 
 Progress = Callable[[str, float], None]
-Lit = delta_cone_tracing.LightField | instant_radiosity.VplSet  # what a method keeps between frames
+Lit = delta_cone_tracing.LightField | instant_radiosity.VplSet  # what a method keeps while only the camera moves
+LitKind = TypeVar("LitKind", delta_cone_tracing.LightField, instant_radiosity.VplSet)
 
 
 class Relighter:
@@ -78,7 +79,8 @@ class Relighter:
             "purposes": purposes,
         }
         self._size = (width, height)
-        self._kept: tuple[str, DeviceScene, Lit | None] | None = None
+        self._uploaded: tuple[str, DeviceScene, Lit | None] | None = None
+        self._kept = Kept()
         self._method_notices: tuple[Notice, ...] = ()
         self.stats: dict[str, Any] = {}
         self.load_seconds = 0.0
@@ -96,6 +98,20 @@ class Relighter:
         self.load_seconds = clock.perf_counter() - start
         self.width, self.height = self._picture_size()
         self._plan(has_plate=self.scene.plate is not None)
+
+    def set_scene(self, scene: Scene) -> None:
+        """Render another moment of the shot from now on; what did not change stays on the device.
+
+        Real meshes, lights and the camera that equal the last frame's are not processed again: put what moves into
+        meshes of role SYNTHETIC. Each frame equals what a new Relighter would make of its scene, bit for bit.
+
+        Raises:
+            OptionError: The Relighter was given a stage, which :meth:`set_time` moves.
+        """
+        if not isinstance(self._stage, Scene):
+            raise OptionError("this Relighter reads a USD stage; move it by set_time, or give it a Scene to begin with")
+        self._stage = scene
+        self.set_time(None)
 
     @property
     def plan(self) -> Plan:
@@ -135,6 +151,7 @@ class Relighter:
             "passes": dict(launcher.pass_seconds),
             "peak_bytes": launcher.peak_bytes,
             "plan": self.plan.to_dict(),
+            "kept": dict(self._kept.reused),
             "notices": [str(n) for n in (*self.scene.notices, *self._method_notices)],
         }
         return layers
@@ -165,42 +182,49 @@ class Relighter:
 
     def _device_scene(self) -> DeviceScene:
         """The scene on the device: the kept one, with the camera of this frame, where nothing else changed."""
-        key = _content_key(self.scene, self.plan)
-        if self._kept is None or self._kept[0] != key:
+        origin, scale = np.asarray(self.plan.origin), self.plan.scale
+        real, key = _content_keys(self.scene, self.plan)
+        if self._uploaded is None or self._uploaded[0] != key:
             with self._launcher.scope("upload"):
-                self._kept = None  # free the old one first
-                uploaded = DeviceScene.upload(self._launcher, self.scene, np.asarray(self.plan.origin), self.plan.scale)
-            self._kept = (key, uploaded, None)
-        device_scene = self._kept[1]
-        frame = camera_frame(self.scene.camera, np.asarray(self.plan.origin), self.plan.scale)
-        return replace(device_scene, camera=frame)
+                self._uploaded = None  # free the old one first
+                self._kept.set_real(real)
+                uploaded = DeviceScene.upload(self._launcher, self.scene, origin, scale, self._kept)
+            self._uploaded = (key, uploaded, None)
+        return replace(self._uploaded[1], camera=camera_frame(self.scene.camera, origin, scale))
+
+    def _lit(self, kind: type[LitKind], make: Callable[[DeviceScene], LitKind]) -> tuple[DeviceScene, LitKind]:
+        """The scene on the device and what the method made of its light, kept until something else than the camera
+        changes."""
+        device_scene = self._device_scene()
+        assert self._uploaded is not None
+        lit = self._uploaded[2]
+        if not isinstance(lit, kind):
+            lit = make(device_scene)
+            self._uploaded = (self._uploaded[0], self._uploaded[1], lit)
+        return device_scene, lit
 
     def _delta_cones(self, with_before: bool, report: Progress) -> Radiance:
         report("volumes", 0.0)
-        device_scene = self._device_scene()
-        assert self._kept is not None
-        light_field = self._kept[2]
-        if not isinstance(light_field, delta_cone_tracing.LightField):
-            light_field = delta_cone_tracing.light_volumes(self._launcher, self.scene, device_scene, self.plan)
-            self._kept = (self._kept[0], self._kept[1], light_field)
+        launcher, scene, plan = self._launcher, self.scene, self.plan
+        device_scene, light_field = self._lit(
+            delta_cone_tracing.LightField,
+            lambda uploaded: delta_cone_tracing.light_volumes(launcher, scene, uploaded, plan, self._kept),
+        )
         report("shading", 0.5)
         return delta_cone_tracing.render(
-            self._launcher, self.scene, device_scene, light_field, self.plan, with_before=with_before
+            launcher, scene, device_scene, light_field, plan, with_before=with_before, kept=self._kept
         )
 
     def _instant_radiosity(self, with_before: bool, report: Progress) -> Radiance:
         report("virtual point lights", 0.0)
-        device_scene = self._device_scene()
-        assert self._kept is not None
-        lights = self._kept[2]
-        if not isinstance(lights, instant_radiosity.VplSet):
-            lights = instant_radiosity.make_vpls(self._launcher, self.scene, device_scene, self.plan)
-            self._kept = (self._kept[0], self._kept[1], lights)
+        launcher, scene, plan = self._launcher, self.scene, self.plan
+        device_scene, lights = self._lit(
+            instant_radiosity.VplSet,
+            lambda uploaded: instant_radiosity.make_vpls(launcher, scene, uploaded, plan),
+        )
         self._method_notices = lights.notices
         report("shading", 0.3)
-        return instant_radiosity.render(
-            self._launcher, self.scene, device_scene, lights, self.plan, with_before=with_before
-        )
+        return instant_radiosity.render(launcher, scene, device_scene, lights, plan, with_before=with_before)
 
     def _path_trace(self, report: Progress) -> Radiance:
         device_scene = self._device_scene()
@@ -218,28 +242,15 @@ class Relighter:
             )
 
 
-def _content_key(scene: Scene, plan: Plan) -> str:
-    """Hash of all that uploaded data and lit volumes depend on: everything but camera, plate and picture size."""
-    digest = hashlib.blake2b(digest_size=16)
-
-    def feed(value: Any) -> None:
-        if isinstance(value, np.ndarray):
-            digest.update(str((value.shape, value.dtype)).encode())
-            digest.update(np.ascontiguousarray(value).data)
-        elif hasattr(value, "__dataclass_fields__"):
-            for name in value.__dataclass_fields__:
-                feed(getattr(value, name))
-        elif isinstance(value, tuple):
-            digest.update(str(len(value)).encode())
-            for item in value:
-                feed(item)
-        else:
-            digest.update(repr(value).encode() + b"\0")
-
-    feed((scene.meshes, scene.materials, scene.textures, scene.lights))
-    feed((plan.settings, plan.origin, plan.scale, plan.fine, plan.coarse, plan.start, plan.maps))
-    feed(tuple(p.needed for p in plan.passes if p.name in ("voxelize", "pyramid", "bounces")))
-    return digest.hexdigest()
+def _content_keys(scene: Scene, plan: Plan) -> tuple[str, str]:
+    """Hashes of the real scene in volume space, and of all that uploaded data and lit volumes depend on: everything
+    but camera, plate and picture size."""
+    surfaces = scene.materials, scene.textures
+    meshes = [tuple(m for m in scene.meshes if m.role == role) for role in Role]
+    real = content_key(meshes[Role.REAL], *surfaces, plan.origin, plan.scale)
+    passes = tuple(p.needed for p in plan.passes if p.name in ("voxelize", "pyramid", "bounces"))
+    rest = (plan.settings, plan.fine, plan.coarse, plan.start, plan.maps, passes)
+    return real, content_key(real, meshes[Role.SYNTHETIC], scene.lights, *rest)
 
 
 def relight(stage: Any, *, plate: np.ndarray | None = None, **options: Any) -> Layers:

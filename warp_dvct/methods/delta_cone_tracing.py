@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
+from warp_dvct.kept import Kept, content_key
 from warp_dvct.kernels import cones, gather, shading, specular
 from warp_dvct.kernels.volume import Volume
 from warp_dvct.launch import Launcher
@@ -30,16 +31,18 @@ from warp_dvct.passes.gather import (
     point_pixels,
     shade_indirect,
 )
-from warp_dvct.passes.gbuffer import GBuffer, render_gbuffer
+from warp_dvct.passes.gbuffer import GBuffer, render_gbuffer, see_real
 from warp_dvct.passes.injection import empty_flux, inject
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
 from warp_dvct.passes.resolve import resolve
-from warp_dvct.passes.rsm import render_rsm
+from warp_dvct.passes.rsm import render_real, render_rsm
 from warp_dvct.passes.shading import shade_direct
 from warp_dvct.passes.specular import find_glossy, shade_specular
-from warp_dvct.passes.voxels import Box, Voxels, voxelize
+from warp_dvct.passes.voxels import Voxels, cut_triangles, part, voxelize
 from warp_dvct.plan import Plan
 from warp_dvct.scene import LightKind, Role, Scene
+
+MAX_RECORDS = 2**31 - 1  # no volume has more: level 0 alone
 
 
 @dataclass(frozen=True)
@@ -57,22 +60,29 @@ class LightField:
     bounces: Any
 
 
-def light_volumes(launcher: Launcher, scene: Scene, device_scene: DeviceScene, plan: Plan) -> LightField:
-    """Voxelise, inject every light's RSM pair, re-inject further bounces, filter (Franke 2014, section 3.2)."""
+def light_volumes(
+    launcher: Launcher, scene: Scene, device_scene: DeviceScene, plan: Plan, kept: Kept | None = None
+) -> LightField:
+    """Voxelise, inject every light's RSM pair, re-inject further bounces, filter (Franke 2014, section 3.2).
+
+    Args:
+        kept: Holds what the real scene alone decides from frame to frame.
+    """
+    kept = kept or Kept()
     settings = plan.settings
     needed = {p.name: p.needed for p in plan.passes}
     normals = launcher.array(_normals(device_scene.triangles_vs), wp.vec3)
     volumes: list[Voxels] = []
     if needed["voxelize"]:
         with launcher.scope("voxelize"):
-            volumes = [_voxelize(launcher, device_scene, normals, b) for b in (plan.fine, plan.coarse) if b]
+            volumes = _voxelize(launcher, device_scene, normals, plan, needed["pyramid"], kept)
     world = _world(launcher, scene, normals, volumes)
     if not volumes:
         return LightField(world, tuple(volumes), bounce_field(launcher, None))
     fluxes = [empty_flux(launcher, v) for v in volumes]
     for voxels, flux in zip(volumes, fluxes, strict=True):
         if settings.bounces > 0:
-            _inject_lights(launcher, device_scene, plan, voxels, flux)
+            _inject_lights(launcher, scene, device_scene, plan, voxels, flux, kept)
         with launcher.scope("light faces"):
             light_faces(launcher, voxels, flux, filter=settings.cones_filter)
     bounces = bounce_field(launcher, None)
@@ -94,14 +104,22 @@ def render(
     plan: Plan,
     *,
     with_before: bool,
+    kept: Kept | None = None,
 ) -> Radiance:
     """Shade what the camera sees (Franke 2014, section 3.3): direct, indirect diffuse, indirect specular, resolve.
 
     Args:
         with_before: Also render the real scene alone, to serve as the plate.
+        kept: Holds what the real scene and the camera alone decide from frame to frame.
     """
     settings, world = plan.settings, light_field.world
     with launcher.scope("gbuffer"):
+        real = None
+        if kept is not None:
+            key = content_key(scene.camera, plan.width, plan.height)
+            real = kept.get(
+                "camera's real hits", key, lambda: see_real(launcher, device_scene, plan.width, plan.height)
+            )
         buffer = render_gbuffer(
             launcher,
             device_scene,
@@ -110,6 +128,7 @@ def render(
             edge_samples=settings.antialias,
             behind=with_before,
             seed=settings.seed,
+            real=real,
         )
     light = launcher.zeros(buffer.count, wp.vec3)
     before = launcher.zeros(buffer.count if with_before else 1, wp.vec3)
@@ -168,9 +187,34 @@ def _normals(triangles: np.ndarray) -> np.ndarray:
     return np.where(length > 0, cross / np.where(length > 0, length, 1.0), [0.0, 0.0, 1.0]).astype(np.float32)
 
 
-def _voxelize(launcher: Launcher, scene: DeviceScene, normals: Any, box: Box) -> Voxels:
+def _voxelize(
+    launcher: Launcher, scene: DeviceScene, normals: Any, plan: Plan, all_levels: bool, kept: Kept
+) -> list[Voxels]:
+    """The fine volume, and the coarse one where there is one; levels as far up as something reads them."""
     corners = launcher.array(scene.triangles_vs.reshape(-1, 3), wp.vec3)
-    return voxelize(launcher, corners, normals, scene.geometry.double_sided, scene.synthetic_first, box)
+    boxes = [box for box in (plan.fine, plan.coarse) if box is not None]
+    volumes = []
+    for box in boxes:
+        real = kept.get(
+            f"real fragments, {'fine' if box is plan.fine else 'coarse'} volume",
+            box,
+            lambda box=box: cut_triangles(launcher, part(launcher, corners, 0, 3 * scene.synthetic_first), box),
+        )
+        # Rays read level 0 alone, and patches (of the last volume) the first level that is coarse enough for them.
+        most = max(1, plan.settings.patches_count // 2) if box is boxes[-1] else MAX_RECORDS
+        volumes.append(
+            voxelize(
+                launcher,
+                corners,
+                normals,
+                scene.geometry.double_sided,
+                scene.synthetic_first,
+                box,
+                most=0 if all_levels else most,
+                real=real,
+            )
+        )
+    return volumes
 
 
 def _world(launcher: Launcher, scene: Scene, normals: Any, volumes: list[Voxels]) -> Any:
@@ -194,22 +238,25 @@ def _no_volume(launcher: Launcher) -> Any:
     return volume
 
 
-def _inject_lights(launcher: Launcher, scene: DeviceScene, plan: Plan, voxels: Voxels, flux: Any) -> None:
+def _inject_lights(
+    launcher: Launcher, scene: Scene, device_scene: DeviceScene, plan: Plan, voxels: Voxels, flux: Any, kept: Kept
+) -> None:
     box = voxels.box
-    middle = [box.low[k] + 0.5 * box.edge for k in range(3)]
+    middle = (box.low[0] + 0.5 * box.edge, box.low[1] + 0.5 * box.edge, box.low[2] + 0.5 * box.edge)
     fine = box is plan.fine
     for entry in plan.maps:
+        size = entry.size if fine else entry.coarse_size
+        target = {"center": middle, "radius": box.edge * math.sqrt(3.0) / 2.0, "start": plan.start + box.edge}
+        target["seed"] = plan.settings.seed
         with launcher.scope("rsm"):
-            maps = render_rsm(
-                launcher,
-                scene,
-                entry.light,
-                entry.size if fine else entry.coarse_size,
-                center=(middle[0], middle[1], middle[2]),
-                radius=box.edge * math.sqrt(3.0) / 2.0,
-                start=plan.start + box.edge,
-                seed=plan.settings.seed,
+            real = kept.get(
+                f"real map of light {entry.light}, {'fine' if fine else 'coarse'} volume",
+                content_key(scene.lights[entry.light], size, tuple(target.items())),
+                lambda entry=entry, size=size, target=target: render_real(
+                    launcher, device_scene, entry.light, size, **target
+                ),
             )
+            maps = render_rsm(launcher, device_scene, entry.light, size, **target, real=real)
         with launcher.scope("inject"):
             inject(launcher, voxels, maps, flux)
 

@@ -42,19 +42,42 @@ class GBuffer:
     behind_count: int
 
 
+def see_real(launcher: Launcher, scene: DeviceScene, width: int, height: int) -> tuple[Any, Any]:
+    """``Points`` of the real scene alone at the pixels' centres, and float ``[pixels]``, where their rays end."""
+    pixels = width * height
+    points, reach = new_points(launcher, pixels), launcher.empty(pixels, wp.float32)
+    launcher.launch(
+        kernels._see_real, pixels, [scene.geometry, scene.materials, scene.camera, width, height], [points, reach]
+    )
+    return points, reach
+
+
 def render_gbuffer(
-    launcher: Launcher, scene: DeviceScene, width: int, height: int, *, edge_samples: int, behind: bool, seed: int = 0
+    launcher: Launcher,
+    scene: DeviceScene,
+    width: int,
+    height: int,
+    *,
+    edge_samples: int,
+    behind: bool,
+    seed: int = 0,
+    real: tuple[Any, Any] | None = None,
 ) -> GBuffer:
     """Trace the camera's rays.
 
     Args:
         edge_samples: Points per edge pixel, spread over its area (box filter); 0 for no anti-aliasing.
         behind: Whether the real surfaces hidden by synthetic ones are needed (where there is no plate).
+        real: What :func:`see_real` gave, where that is at hand; it is not written to.
     """
     pixels = width * height
-    centers = new_points(launcher, pixels)
     shared = [scene.geometry, scene.materials, scene.camera]
-    launcher.launch(kernels._see_centers, pixels, [*shared, width, height], [centers])
+    if real is None:
+        centers, reach = see_real(launcher, scene, width, height)
+    else:
+        centers, reach = copied(launcher, real[0]), real[1]
+    if scene.synthetic is not None:
+        launcher.launch(kernels._see_synthetic, pixels, [*shared, reach, width, height], [centers])
     mark = launcher.zeros(pixels, wp.int32)
     if edge_samples > 0:
         launcher.launch(kernels._mark_edges, pixels, [centers, width, height], [mark])
@@ -85,6 +108,16 @@ def new_points(launcher: Launcher, count: int) -> Any:
     for name, variable in Points.vars.items():
         setattr(points, name, launcher.zeros(max(count, 1), variable.type.dtype))
     return points
+
+
+def copied(launcher: Launcher, points: Any) -> Any:
+    """A copy of ``Points``."""
+    copy = Points()
+    for name, variable in Points.vars.items():
+        source = getattr(points, name)
+        setattr(copy, name, launcher.empty(source.shape[0], variable.type.dtype))
+        wp.copy(getattr(copy, name), source)
+    return copy
 
 
 def extended(launcher: Launcher, points: Any, old: int, count: int) -> Any:

@@ -10,6 +10,7 @@ import warp as wp
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import rsm as kernels
 from warp_dvct.launch import Launcher
+from warp_dvct.scene import LightRole
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,38 @@ class ShadowMaps:
     role_before: Any
 
 
+@dataclass(frozen=True)
+class RealMap:
+    """What a light's beams meet in the real scene: as in :class:`ShadowMaps`, and float ``reach``, how far they go."""
+
+    size: int
+    reach: Any
+    position: Any
+    normal: Any
+    flux: Any
+    role: Any
+
+
+def render_real(
+    launcher: Launcher,
+    scene: DeviceScene,
+    light: int,
+    size: int,
+    *,
+    center: tuple[float, float, float],
+    radius: float,
+    start: float,
+    seed: int = 0,
+) -> RealMap:
+    """The part of :func:`render_rsm` that does not depend on synthetic objects; the arguments are the same."""
+    target = _target(center, radius, start)
+    count = size * size
+    arrays = [launcher.empty(count, dtype) for dtype in (wp.float32, wp.vec3, wp.vec3, wp.vec3, wp.int32)]
+    shared = [scene.geometry, scene.materials, scene.lights, target, light, size, seed]
+    launcher.launch(kernels._render_real, count, shared, arrays)
+    return RealMap(size, *arrays)
+
+
 def render_rsm(
     launcher: Launcher,
     scene: DeviceScene,
@@ -43,6 +76,7 @@ def render_rsm(
     radius: float,
     start: float,
     seed: int = 0,
+    real: RealMap | None = None,
 ) -> ShadowMaps:
     """Follow ``size * size`` beams of a light that cover the sphere at ``center``.
 
@@ -51,16 +85,27 @@ def render_rsm(
         size: Texels an edge, at least 1.
         center, radius: The target sphere in volume space.
         start: Distance from the centre at which parallel beams start; beyond everything that casts shadows.
+        real: What :func:`render_real` gave for the same arguments, where that is at hand; it is not written to.
 
     Franke 2014, section 3.2 (RSM pair); the flux of a texel does not depend on ``size``.
     """
+    if real is None:
+        real = render_real(launcher, scene, light, size, center=center, radius=radius, start=start, seed=seed)
+    count = size * size
+    alone = [real.position, real.normal, real.flux, real.role]
+    before, after = alone, alone
+    if int(scene.lights.role.numpy()[light]) == LightRole.ADDED:  # it has no before
+        before = [*alone[:3], launcher.full(count, -1, wp.int32)]
+    if scene.synthetic is not None:
+        after = [launcher.empty(count, dtype) for dtype in (wp.vec3, wp.vec3, wp.vec3, wp.int32)]
+        shared = [scene.geometry, scene.materials, scene.lights, _target(center, radius, start), light, size, seed]
+        launcher.launch(kernels._render_after, count, [*shared, real.reach, *alone], after)
+    return ShadowMaps(size, *after, *before)
+
+
+def _target(center: tuple[float, float, float], radius: float, start: float) -> Any:
     target = kernels.Target()
     target.center = wp.vec3(*center)
     target.radius = radius
     target.start = start
-    count = size * size
-    arrays = [launcher.empty(count, dtype) for dtype in (wp.vec3, wp.vec3, wp.vec3, wp.int32) * 2]
-    launcher.launch(
-        kernels._render_rsm, count, [scene.geometry, scene.materials, scene.lights, target, light, size, seed], arrays
-    )
-    return ShadowMaps(size, *arrays)
+    return target

@@ -71,8 +71,31 @@ class Voxels:
     fragments: Fragments
 
 
+@dataclass(frozen=True)
+class Pieces:
+    """Fragments of one role's triangles, sorted by voxel.
+
+    Attributes:
+        key: int, voxel keys. triangle: int, index among that role's triangles. place: As in :class:`Fragments`.
+        count: How many.
+    """
+
+    key: Any
+    triangle: Any
+    place: Any
+    count: int
+
+
 def voxelize(
-    launcher: Launcher, triangles: Any, normals: Any, double_sided: Any, synthetic_first: int, box: Box
+    launcher: Launcher,
+    triangles: Any,
+    normals: Any,
+    double_sided: Any,
+    synthetic_first: int,
+    box: Box,
+    *,
+    most: int = 0,
+    real: Pieces | None = None,
 ) -> Voxels:
     """Cut triangles by the voxel grid and build the brick maps of all levels.
 
@@ -82,18 +105,20 @@ def voxelize(
         double_sided: int ``[t]``; non-zero where the back faces show as well.
         synthetic_first: Index of the first synthetic triangle.
         box: The grid, ``n`` from 1 to 1024.
+        most: Levels are built until one has no more records than this; 0 for all levels.
+        real: What :func:`cut_triangles` made of the real triangles, where that is at hand.
     Returns:
         Voxels with a zero field. Triangles outside of the box are left out.
     """
-    fragments, keys = _cut(launcher, triangles, box)
-    key0 = keys
-    level_keys = [key0]
-    levels = 1
-    while (box.n - 1) >> (levels - 1) > 0:
-        level_keys.append(_parents(launcher, level_keys[-1], box.n, levels - 1))
-        levels += 1
+    if real is None:
+        real = cut_triangles(launcher, part(launcher, triangles, 0, 3 * synthetic_first), box)
+    synthetic = cut_triangles(launcher, part(launcher, triangles, 3 * synthetic_first, triangles.shape[0]), box)
+    fragments, keys = _join(launcher, real, synthetic, synthetic_first)
+    level_keys = [keys]
+    while (box.n - 1) >> (len(level_keys) - 1) > 0 and (most == 0 or level_keys[-1].shape[0] > most):
+        level_keys.append(_parents(launcher, level_keys[-1], box.n, len(level_keys) - 1))
     volume = _build_maps(launcher, level_keys, box)
-    records = key0.shape[0]
+    records = keys.shape[0]
     area = launcher.zeros(max(records, 1) * 6, wp.vec2)
     launcher.launch(
         kernels._sum_areas,
@@ -114,8 +139,13 @@ def voxelize(
     return Voxels(box, volume, tuple(k.shape[0] for k in level_keys), tuple(level_keys), area, fragments)
 
 
-def _cut(launcher: Launcher, triangles: Any, box: Box) -> tuple[Fragments, Any]:
-    """Fragments and the sorted unique keys of the voxels that hold them."""
+def part(launcher: Launcher, array: Any, start: int, stop: int) -> Any:
+    """``array[start:stop]``, which Warp's slices refuse to be where it is empty."""
+    return array[start:stop] if start < stop else launcher.empty(0, array.dtype)
+
+
+def cut_triangles(launcher: Launcher, triangles: Any, box: Box) -> Pieces:
+    """The fragments of triangles in a grid, sorted by voxel and, within a voxel, by triangle."""
     grid = [wp.vec3(*box.low), box.voxel, box.n]
     count = triangles.shape[0] // 3
     per_triangle = launcher.zeros(max(count, 1), wp.int32)
@@ -128,20 +158,40 @@ def _cut(launcher: Launcher, triangles: Any, box: Box) -> tuple[Fragments, Any]:
     per_tile = launcher.zeros(max(total, 1), wp.int32)
     launcher.launch(kernels._count_fragments, total, [triangles, tile_triangle, tile, *grid], [per_tile])
     ends, listed = scan(launcher, per_tile)
-    key = launcher.empty(max(2 * listed, 1), wp.int32)
+    cut_key = launcher.empty(max(2 * listed, 1), wp.int32)
     order = launcher.empty(max(2 * listed, 1), wp.int32)
-    fragment_triangle = launcher.empty(max(listed, 1), wp.int32)
-    place = launcher.empty(max(listed, 1), wp.vec4)
+    cut_triangle = launcher.empty(max(listed, 1), wp.int32)
+    cut_place = launcher.empty(max(listed, 1), wp.vec4)
     launcher.launch(
         kernels._cut_fragments,
         total,
         [triangles, tile_triangle, tile, ends, per_tile, *grid],
-        [key, fragment_triangle, place],
+        [cut_key, cut_triangle, cut_place],
     )
-    sort_by_key(launcher, key, order, listed)
-    keys, starts = unique_runs(launcher, key, listed)
-    valid = count_below(launcher, key, listed)
-    return Fragments(fragment_triangle, place, order, starts, valid), keys
+    sort_by_key(launcher, cut_key, order, listed)
+    valid = count_below(launcher, cut_key, listed)
+    key, triangle = launcher.empty(max(valid, 1), wp.int32), launcher.empty(max(valid, 1), wp.int32)
+    place = launcher.empty(max(valid, 1), wp.vec4)
+    sources = [order, cut_key, cut_triangle, cut_place]
+    launcher.launch(kernels._sort_fragments, valid, sources, [key, triangle, place])
+    return Pieces(key, triangle, place, valid)
+
+
+def _join(launcher: Launcher, real: Pieces, synthetic: Pieces, synthetic_first: int) -> tuple[Fragments, Any]:
+    """All fragments, sorted by voxel with the real ones first, and the sorted unique keys of the voxels."""
+    count = real.count + synthetic.count
+    key, triangle, order = (launcher.empty(max(count, 1), wp.int32) for _ in range(3))
+    place = launcher.empty(max(count, 1), wp.vec4)
+    for mine, other, ties, first in ((real, synthetic, 0, 0), (synthetic, real, 1, synthetic_first)):
+        launcher.launch(
+            kernels._join_fragments,
+            mine.count,
+            [mine.key, mine.triangle, mine.place, other.key, other.count, ties, first],
+            [key, triangle, place],
+        )
+    launcher.launch(kernels._count_up, count, [], [order])
+    keys, starts = unique_runs(launcher, key, count)
+    return Fragments(triangle, place, order, starts, count), keys
 
 
 def sort_by_key(launcher: Launcher, key: Any, order: Any, count: int) -> None:

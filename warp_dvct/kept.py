@@ -1,0 +1,79 @@
+"""What a moving shot keeps between frames: results that depend on the static, real part of the scene alone.
+
+Every pass that uses it does its real part by the same code whether the result is kept or not, and nothing writes to
+what is kept: a frame of a shot equals the same frame rendered from scratch bit for bit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+
+Value = TypeVar("Value")
+
+
+class Kept:
+    """Named results of the real scene, each valid for one key; a new key replaces the old result.
+
+    Attributes:
+        real: Key of the real scene and of volume space; every result depends on it.
+        reused: Per name, whether the last request was served from what was kept.
+    """
+
+    def __init__(self) -> None:
+        self.real = ""
+        self.reused: dict[str, bool] = {}
+        self._entries: dict[str, tuple[Any, Any]] = {}
+
+    def set_real(self, key: str) -> None:
+        """Say which real scene follows; another one than before frees all that was kept."""
+        if key != self.real:
+            self.real = key
+            self._entries.clear()
+
+    def get(self, name: str, key: Any, make: Callable[[], Value]) -> Value:
+        """The result ``name`` for ``key``: the kept one, or that of ``make``, which is then kept."""
+        entry = self._entries.get(name)
+        self.reused[name] = entry is not None and entry[0] == key
+        if entry is not None and entry[0] == key:
+            return entry[1]
+        entry = None
+        self._entries.pop(name, None)  # free the old one first
+        value = make()
+        self._entries[name] = (key, value)
+        return value
+
+    def last(self, name: str) -> Any:
+        """What was kept under ``name`` last, or None."""
+        entry = self._entries.get(name)
+        return None if entry is None else entry[1]
+
+    def put(self, name: str, value: Any) -> None:
+        """Keep ``value``, for results that find out element by element what of the last one still holds."""
+        self.reused[name] = name in self._entries
+        self._entries[name] = (None, value)
+
+
+def content_key(*values: Any) -> str:
+    """Hash of plain data: arrays, dataclasses, tuples, numbers, strings and None."""
+    digest = hashlib.blake2b(digest_size=16)
+
+    def feed(value: Any) -> None:
+        if isinstance(value, np.ndarray):
+            digest.update(str((value.shape, value.dtype)).encode())
+            digest.update(np.ascontiguousarray(value).data)
+        elif hasattr(value, "__dataclass_fields__"):
+            for name in value.__dataclass_fields__:
+                feed(getattr(value, name))
+        elif isinstance(value, tuple):
+            digest.update(str(len(value)).encode())
+            for item in value:
+                feed(item)
+        else:
+            digest.update(repr(value).encode() + b"\0")
+
+    feed(values)
+    return digest.hexdigest()
