@@ -60,9 +60,10 @@ def bounced_irradiance(field: BounceField, position: wp.vec3, normal: wp.vec3) -
                         weight = (near + NEAREST_SHARE) * share
                         result.after += field.irradiance[2 * patch + 1] * weight
                         weight_after += weight
-                        if field.real[patch] != 0:
-                            result.before += field.irradiance[2 * patch] * weight
-                            weight_before += weight
+                        # What an object's face would get without objects is right for the real surface close behind.
+                        weight *= wp.where(field.real[patch] != 0, 1.0, NEAREST_SHARE)
+                        result.before += field.irradiance[2 * patch] * weight
+                        weight_before += weight
     result.before = result.before / wp.max(weight_before, 1.0e-12)
     result.after = result.after / wp.max(weight_after, 1.0e-12)
     return result

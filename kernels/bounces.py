@@ -247,18 +247,25 @@ def _bounce(
     irradiance_out: wp.array(dtype=wp.vec3),
     total_out: wp.array(dtype=wp.vec3),
 ):
-    """The next bounce's irradiance from the last one's, along the links; ``total_out`` collects all bounces."""
+    """The next bounce's irradiance from the last one's, along the links; ``total_out`` collects all bounces.
+
+    Where an object lies so close before a real surface that the patch behind their face is the object's, nothing is
+    known of that surface before: its rays are taken to bring what the others bring.
+    """
     i = first + wp.tid()
+    known = float(0.0)
     before = wp.vec3(0.0, 0.0, 0.0)
     after = wp.vec3(0.0, 0.0, 0.0)
     for k in range(rays):
         link = link_in[i * rays + k]
-        if link[0] >= 0:
-            if patches.real[link[0]] != 0:
-                before += wp.cw_mul(patches.albedo[link[0]], irradiance_in[2 * link[0]])
+        if link[0] < 0:
+            known += 1.0
+        elif patches.real[link[0]] != 0:
+            known += 1.0
+            before += wp.cw_mul(patches.albedo[link[0]], irradiance_in[2 * link[0]])
         if link[1] >= 0:
             after += wp.cw_mul(patches.albedo[link[1]], irradiance_in[2 * link[1] + 1])
-    before = before / float(rays)
+    before = before / wp.max(known, 1.0)
     after = after / float(rays)
     irradiance_out[2 * i] = before
     irradiance_out[2 * i + 1] = after
