@@ -166,24 +166,26 @@ def test_a_pair_of_maps_only_where_an_object_stands_in_the_light(name):
 
 
 @pytest.mark.parametrize(
-    "source",
+    ("source", "shape"),
     [
-        light(position=(0.45, 0.35, 0.5)),
-        light(position=(0.5, 3.0, 0.5)),
-        light(cone_angle=0.3),
-        light(LightKind.SPHERE, radius=0.05, position=(0.5, 2.0, 0.5)),
-        light(LightKind.RECT, axis_x=(0.1, 0, 0), axis_y=(0, 0, 0.1)),
-        light(LightKind.RECT, axis_x=(0.1, 0, 0), axis_y=(0, 0, 0.1), position=(0.5, 5.0, 0.5)),
-        light(LightKind.DISTANT),
-        light(LightKind.DOME),
+        (light(position=(0.45, 0.35, 0.5)), "sphere"),
+        (light(position=(0.5, 3.0, 0.5)), "cap"),
+        (light(cone_angle=0.3), "perspective"),
+        (light(cone_angle=0.3, position=(0.5, 9.0, 0.5)), "cap"),
+        (light(LightKind.SPHERE, radius=0.05, position=(0.5, 2.0, 0.5)), "cap"),
+        (light(LightKind.RECT, axis_x=(0.1, 0, 0), axis_y=(0, 0, 0.1)), "hemisphere"),
+        (light(LightKind.RECT, axis_x=(0.1, 0, 0), axis_y=(0, 0, 0.1), position=(0.5, 5.0, 0.5)), "cap"),
+        (light(LightKind.DISTANT), "orthographic"),
+        (light(LightKind.DOME), "orthographic"),
     ],
-    ids=["near point", "far point", "spot", "sphere", "rect", "far rect", "sun", "dome"],
+    ids=["near point", "far point", "spot", "far spot", "sphere", "rect", "far rect", "sun", "dome"],
 )
-def test_texels_are_no_larger_than_voxels(source):
+def test_texels_are_no_larger_than_voxels(source, shape):
     """At the fine volume's far side, for a surface that faces the light; and at most 2.5 times finer than needed."""
     plan = plan_of(room(source), rsm__texels=8192, volume__resolution=64)
     entry = plan.maps[0]
     assert not entry.limited
+    assert entry.shape == shape
     edge = 1 / plan.scale
     center, radius = np.array(plan.origin) + 0.5 * edge, edge * np.sqrt(3) / 2
     voxel = edge / 64

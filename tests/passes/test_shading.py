@@ -119,22 +119,30 @@ def test_penumbra_of_a_rectangle(launcher, probes, bias):
     assert penumbra.sum() > 40
 
 
-@pytest.mark.parametrize("name", LIGHTS)
+LARGE = LIGHTS | {
+    "sphere": light(LightKind.SPHERE, radius=0.15),
+    "rect": light(LightKind.RECT, axis_x=(0.3, 0, 0.02), axis_y=(0, 0, 0.2)),
+    "disk": light(LightKind.DISK, axis_x=(0.25, 0, 0), axis_y=(0, 0, 0.25)),
+    "sun": light(LightKind.DISTANT, angle=1.0),
+}
+
+
+@pytest.mark.parametrize("name", LARGE)
 def test_culling_by_bounding_spheres_changes_nothing(launcher, name):
     """The synthetic objects' sphere only saves rays: as if it were endless, from every side of the light."""
     rng = np.random.default_rng(8)
-    pieces = [lit.cuboid(rng.uniform(0.3, 0.7, 3), rng.uniform(0.02, 0.08, 3), 30.0 * k) for k in range(2)]
-    objects = [lit.mesh(p, Role.SYNTHETIC) for p in pieces]
+    middle = rng.uniform(0.4, 0.6, 3)
+    objects = [lit.mesh(lit.ball(middle + [0, 0.04 * k, 0], 0.02, 8), Role.SYNTHETIC) for k in range(2)]
     walls = lit.room(0.48)
     if LIGHTS[name].kind == LightKind.DISTANT:
         walls = walls[walls[..., 1].mean(-1) < 0.97]  # lets it in from above
     for position in ((0.5, 0.8, 0.5), (0.05, 0.55, 0.9), (0.5, 0.5, 0.45)):
-        source = replace(LIGHTS[name], position=position)
+        source = replace(LARGE[name], position=position)
         scene = lit.scene_of(lit.mesh(walls), *objects, lights=(source,))
         points, _ = lit.points_on(launcher, lit.upload(launcher, scene), 1500, inset=0.01)
-        direct = lit.direct_settings(scene, samples=4, with_before=False)
+        direct = lit.direct_settings(scene, samples=16, with_before=False)
         culled = shaded(launcher, scene, points, 1500, direct=direct)[0]
-        direct = lit.direct_settings(scene, samples=4, with_before=False)
+        direct = lit.direct_settings(scene, samples=16, with_before=False)
         direct.center, direct.radius = wp.vec3(0.0, 0.0, 0.0), 1e6
         np.testing.assert_array_equal(culled, shaded(launcher, scene, points, 1500, direct=direct)[0])
         if name != "spot":
