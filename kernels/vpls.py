@@ -230,3 +230,13 @@ def _spread_vpls(first: int, vpls: Vpls, start: int, count: int, scale: float, l
                         near[2 - k] = near[3 - k]
                         near[3 - k] = swap
     vpls.spread[i] = scale * near[3] / wp.sqrt(float(NEIGHBOURS))
+
+
+@wp.kernel
+def _scale_vpls(first: int, start: int, visible: float, hidden: float, synthetic: float, vpls: Vpls):
+    """Multiply the flux of each class: seen real surfaces, real ones behind synthetic ones, and all else."""
+    i = start + first + wp.tid()
+    factor = synthetic
+    if vpls.real[i] != 0:
+        factor = wp.where(vpls.hidden[i] != 0, hidden, visible)
+    vpls.flux[i] = vpls.flux[i] * factor

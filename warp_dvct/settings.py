@@ -87,7 +87,7 @@ class Settings:
         0.15, "least share of VPLs on synthetic surfaces and on real ones behind; 0 by area", low=0.0, high=0.4
     )
     vpls_clamp: float = _knob(
-        1.0, "radius of a VPL's disc, over that of its share of surface; 0 for points", low=0.0, high=16.0
+        0.5, "radius of a VPL's disc, over that of its share of surface; 0 for points", low=0.0, high=16.0
     )
     vpls_tiles: int = _knob(
         4, "edge of the tiles whose pixels share the VPLs out; 1 for all at every pixel", low=1, high=16

@@ -45,7 +45,8 @@ class LightMaps:
         maps: ``kernels.vpls.Maps``.
         real, synthetic: Importance of the two maps.
         synthetic_share: Probability of the synthetic map.
-        flux: Luminance of the flux that the surfaces in the maps reflect, each beam counted once.
+        fluxes: Luminance of the flux that is reflected by seen real surfaces, by real ones behind synthetic ones, and
+            by synthetic ones (or, of an added light, by all).
     """
 
     light: int
@@ -53,7 +54,12 @@ class LightMaps:
     real: Importance
     synthetic: Importance
     synthetic_share: float
-    flux: float
+    fluxes: tuple[float, float, float]
+
+    @property
+    def flux(self) -> float:
+        """The sum of ``fluxes``."""
+        return sum(self.fluxes)
 
 
 def new_vpls(launcher: Launcher, count: int) -> Any:
@@ -120,7 +126,7 @@ def light_maps(
         build_importance(launcher, real, size, size),
         build_importance(launcher, synthetic, size, size),
         share,
-        _reflected(rsm),
+        _reflected(rsm, added, single),
     )
 
 
@@ -142,12 +148,17 @@ def _hidden_gain(real: np.ndarray, hidden: np.ndarray, least: float) -> float:
     return least / (1.0 - least) * front / behind
 
 
-def _reflected(rsm: ShadowMaps) -> float:
-    """Luminance of the flux reflected after, and of that before where something synthetic is in front."""
+def _reflected(rsm: ShadowMaps, added: bool, single: bool) -> tuple[float, float, float]:
+    """Luminance of the reflected flux of each class of VPLs."""
     after, before = rsm.role_after.numpy(), rsm.role_before.numpy()
-    total = rsm.flux_after.numpy()[after >= 0].sum(0, dtype=np.float64)
-    total = total + rsm.flux_before.numpy()[(before == 0) & (after == 1)].sum(0, dtype=np.float64)
-    return float(total @ LUMINANCE)
+
+    def total(flux: Any, chosen: np.ndarray) -> float:
+        return float(flux.numpy()[chosen].sum(0, dtype=np.float64) @ LUMINANCE)
+
+    if added:
+        return 0.0, 0.0, total(rsm.flux_after, after >= 0)
+    hidden = 0.0 if single else total(rsm.flux_before, (before == 0) & (after == 1))
+    return total(rsm.flux_before, (before == 0) & (after != 1)), hidden, total(rsm.flux_after, after == 1)
 
 
 def share_out(weights: list[float], count: int) -> list[int]:
@@ -196,8 +207,22 @@ def choose_vpls(
                 vpls,
             ],
         )
+        _balance(launcher, maps, vpls, start + made, share)
         made += share
     return made
+
+
+def _balance(launcher: Launcher, maps: LightMaps, vpls: Any, start: int, count: int) -> None:
+    """Scale each class of a light's VPLs to the flux that its maps hold: a few VPLs then carry the right light, if not
+    from quite the right places. The ratio's own bias falls as 1 / N."""
+    end = start + count
+    flux = vpls.flux.numpy()[start:end] @ LUMINANCE
+    real, hidden = vpls.real.numpy()[start:end] == 1, vpls.hidden.numpy()[start:end] == 1
+    factors = []
+    for members, expected in zip((real & ~hidden, hidden, ~real), maps.fluxes, strict=True):
+        found = float(flux[members].sum(dtype=np.float64))
+        factors.append(expected / found if found > 0.0 else 1.0)
+    launcher.launch(kernels._scale_vpls, count, [start, *factors, vpls])
 
 
 def choose_sky(launcher: Launcher, env: Any, vpls: Any, start: int, count: int, *, seed: int) -> int:
