@@ -132,11 +132,12 @@ def test_culling_by_bounding_spheres_changes_nothing(launcher, name):
     """The synthetic objects' sphere only saves rays: as if it were endless, from every side of the light."""
     rng = np.random.default_rng(8)
     middle = rng.uniform(0.4, 0.6, 3)
-    objects = [lit.mesh(lit.ball(middle + [0, 0.04 * k, 0], 0.02, 8), Role.SYNTHETIC) for k in range(2)]
+    objects = [lit.mesh(lit.ball(middle + 0.04 * k * lit.EYES[1], 0.02, 8), Role.SYNTHETIC) for k in range(2)]
     walls = lit.room(0.48)
     if LIGHTS[name].kind == LightKind.DISTANT:
         walls = walls[walls[..., 1].mean(-1) < 0.97]  # lets it in from above
-    for position in ((0.5, 0.8, 0.5), (0.05, 0.55, 0.9), (0.5, 0.5, 0.45)):
+    any_shadow = False
+    for position in ((0.5, 0.8, 0.5), (0.05, 0.55, 0.9), (0.5, 0.3, 0.45)):
         source = replace(LARGE[name], position=position)
         scene = lit.scene_of(lit.mesh(walls), *objects, lights=(source,))
         points, _ = lit.points_on(launcher, lit.upload(launcher, scene), 1500, inset=0.01)
@@ -145,8 +146,8 @@ def test_culling_by_bounding_spheres_changes_nothing(launcher, name):
         direct = lit.direct_settings(scene, samples=16, with_before=False)
         direct.center, direct.radius = wp.vec3(0.0, 0.0, 0.0), 1e6
         np.testing.assert_array_equal(culled, shaded(launcher, scene, points, 1500, direct=direct)[0])
-        if name != "spot":
-            assert culled.any()
+        any_shadow |= bool(culled.any())
+    assert any_shadow
 
 
 @pytest.mark.parametrize("name", LIGHTS)
