@@ -1,4 +1,4 @@
-"""``python -m warp_dvct.bench error | eq9 | table1 | instant-radiosity``: see ``docs/benchmarks.md``."""
+"""``python -m warp_dvct.bench error | curve | compare | peers | …``: see ``docs/benchmarks.md``."""
 
 from __future__ import annotations
 
@@ -171,6 +171,33 @@ def compare(stage: str, texts: tuple[str, ...], spp: int, pairs: tuple[str, ...]
     from warp_dvct.bench import sweep as module
 
     _sweep(stage, module.parse_trials(texts), spp, pairs, json_file, cache, rest)
+
+
+@bench.command()
+@click.option("--stage", "stages", multiple=True, help="A bundled stage or a USD file; repeatable. Default: room_area.")
+@click.option(
+    "--samples", "peer_samples", type=int, multiple=True, default=(4, 16, 64), show_default=True, help="Of the peers."
+)
+@click.option("--width", type=int, default=320, show_default=True, help="Pixels; the height follows the camera.")
+@click.option("--spp", type=int, default=128, show_default=True, help="Samples per pixel of the truth.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Of the truth's random numbers.")
+@click.option("--bounces", type=int, default=1, show_default=True, help="Of the truth and of the path tracers.")
+@click.option("--cache", type=click.Path(path_type=Path), help="References; default: warp_dvct in the user's cache.")
+@click.option("--device", default="cpu", show_default=True, help="Of our methods: cpu or cuda:N.")
+@click.option("--threads", type=int, help="CPU threads; all cores by default. The denoiser takes all.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file too.")
+def peers(stages: tuple[str, ...], spp: int, cache: Path | None, json_file: Path | None, **rest: Any) -> None:
+    """Beside Mitsuba 3 with and without Intel's denoiser: error against our truth, seconds in the same run."""
+    start_warp(rest["device"])
+    from warp_dvct.bench import peers as module
+
+    options = module.PeerOptions(samples=spp, cache=cache or cache_folder() / "references", **rest)
+    reports = []
+    for stage in stages or ("room_area",):
+        reports.append(module.measure(stage, options))
+        click.echo(module.format_report(reports[-1]))
+    if json_file is not None:
+        write_json(json_file, {"options": asdict(options), "stages": [asdict(report) for report in reports]})
 
 
 def _sweep(stage: str, trials: Any, spp: int, pairs: tuple[str, ...], json_file: Path | None, cache, rest: Any) -> None:
