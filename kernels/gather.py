@@ -8,6 +8,7 @@ from warp_dvct.kernels.gbuffer import BACKGROUND, SYNTHETIC, Points, load_surfac
 from warp_dvct.kernels.geometry import (
     FAR,
     Geometry,
+    Hit,
     occluded_by_real,
     occluded_by_synthetic,
     trace_real,
@@ -133,12 +134,16 @@ def radiosity_at(world: World, position: wp.vec3, normal: wp.vec3, footprint: fl
 
 
 @wp.func
-def ray_incident(world: World, geo: Geometry, origin: wp.vec3, direction: wp.vec3, solid_angle: float) -> Incident:
-    """Light along an exact ray, before and after: the hit voxel's radiosity, or the environment's."""
+def hit_incident(
+    world: World, geo: Geometry, real: Hit, origin: wp.vec3, direction: wp.vec3, solid_angle: float
+) -> Incident:
+    """Light along an exact ray, before and after: the hit voxel's radiosity, or the environment's.
+
+    ``real`` is what the ray meets in the real scene.
+    """
     result = Incident()
     result.before = wp.vec3(0.0, 0.0, 0.0)
     result.after = wp.vec3(0.0, 0.0, 0.0)
-    real = trace_real(geo, origin, direction, FAR)
     synthetic = trace_synthetic(geo, origin, direction, real.t)
     width = wp.sqrt(solid_angle)
     if real.found != 0:
@@ -156,6 +161,12 @@ def ray_incident(world: World, geo: Geometry, origin: wp.vec3, direction: wp.vec
     result.distance_before = real.t
     result.distance_after = synthetic.t
     return result
+
+
+@wp.func
+def ray_incident(world: World, geo: Geometry, origin: wp.vec3, direction: wp.vec3, solid_angle: float) -> Incident:
+    """As ``hit_incident``, for a ray that nobody has traced yet."""
+    return hit_incident(world, geo, trace_real(geo, origin, direction, FAR), origin, direction, solid_angle)
 
 
 @wp.func
@@ -220,6 +231,35 @@ def cone_incident(
     return result
 
 
+@wp.struct
+class KeptRays:
+    """What the rays of gather points met in the real scene, from frame to frame of a shot.
+
+    A slot holds one point's rays; it is refilled whenever its point is another one.
+    """
+
+    present: wp.int32  # 0: nothing is kept, the arrays are empty
+    point: wp.array(dtype=wp.int32)  # [slots], -1 at first
+    reach: wp.array(dtype=wp.float32)  # [slots * rays], hit distance
+    triangle: wp.array(dtype=wp.int32)  # [slots * rays], -1 where the ray meets nothing
+
+
+@wp.func
+def kept_real(kept: KeptRays, known: bool, at: int, geo: Geometry, origin: wp.vec3, direction: wp.vec3) -> Hit:
+    """The real surface along a ray: the kept one, or a traced one, which is kept."""
+    hit = Hit()
+    if known:
+        hit.t = kept.reach[at]
+        hit.triangle = kept.triangle[at]
+        hit.found = wp.where(hit.triangle >= 0, 1, 0)
+    else:
+        hit = trace_real(geo, origin, direction, FAR)
+        if kept.present != 0:
+            kept.reach[at] = hit.t
+            kept.triangle[at] = hit.triangle
+    return hit
+
+
 @wp.kernel
 def _gather_rays(
     first: int,
@@ -229,6 +269,7 @@ def _gather_rays(
     world: World,
     rays: int,
     seed: int,
+    kept_out: KeptRays,
     before_out: wp.array(dtype=wp.vec3),
     after_out: wp.array(dtype=wp.vec3),
     nearness_out: wp.array(dtype=wp.float32),
@@ -245,15 +286,22 @@ def _gather_rays(
     if j >= 0:
         if points.role[j] != BACKGROUND:
             s = load_surface(points, j)
+            known = False
+            if kept_out.present != 0:
+                known = kept_out.point[i] == j
             for k in range(rays):
                 local = cosine_hemisphere(sobol2(seed, j, k, 11))
                 direction = from_frame(local, s.normal)
                 solid_angle = PI / (float(rays) * wp.max(local[2], 0.05))
                 if wp.dot(direction, s.normal_g) > 0.0:
-                    light = ray_incident(world, geo, spawn_point(s, direction), direction, solid_angle)
+                    origin = spawn_point(s, direction)
+                    real = kept_real(kept_out, known, i * rays + k, geo, origin, direction)
+                    light = hit_incident(world, geo, real, origin, direction, solid_angle)
                     before += light.before
                     after += light.after
                     nearness += 1.0 / wp.max(wp.min(light.distance_before, light.distance_after), 1.0e-6)
+            if kept_out.present != 0:
+                kept_out.point[i] = j
     before_out[i] = before / float(rays)
     after_out[i] = after / float(rays)
     nearness_out[i] = nearness / float(rays)

@@ -117,6 +117,27 @@ def look(geo: Geometry, origin: wp.vec3, direction: wp.vec3, reach: float, need_
 
 
 @wp.func
+def untouched(s: Surface, wo: wp.vec3, i: int, geo: Geometry, lights: Lights, k: int, direct: Direct) -> bool:
+    """Whether the probes of ``light_part`` meet no synthetic object: the light then does not change, to the last bit.
+
+    Most real points are such, and for them this leaves out the unshadowed light of every sample.
+    """
+    lit = bool(False)
+    count = int(0)
+    while count < direct.probes:
+        light = sample_light(lights, k, s.position, sobol2(direct.seed, i, count, 2 * k + 3))
+        if not lit:
+            f = reflected(s, wo, light, direct)
+            lit = wp.max(f[0], wp.max(f[1], f[2])) > 0.0
+        if occluded_by_synthetic(geo, spawn_point(s, light.direction), light.direction, light.distance * SHADOW_END):
+            return False
+        count += 1
+        if light.pdf <= 0.0:
+            return True
+    return lit
+
+
+@wp.func
 def light_part(
     points: Points,
     i: int,
@@ -136,6 +157,8 @@ def light_part(
     need_before = int(1)
     if delta_only and direct.with_before == 0:
         need_before = 0
+        if untouched(s, wo, i, geo, lights, k, direct):
+            return Part()
     open = wp.vec3(0.0, 0.0, 0.0)
     sum_before = wp.vec3(0.0, 0.0, 0.0)
     sum_after = wp.vec3(0.0, 0.0, 0.0)

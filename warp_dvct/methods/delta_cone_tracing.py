@@ -27,6 +27,7 @@ from warp_dvct.passes.gather import (
     Gatherer,
     gather_all,
     gather_sparse,
+    keep_rays,
     merge,
     point_pixels,
     shade_indirect,
@@ -42,6 +43,7 @@ from warp_dvct.passes.voxels import Voxels, cut_triangles, part, voxelize
 from warp_dvct.plan import Plan
 from warp_dvct.scene import LightKind, Role, Scene
 
+MOST_KEPT_RAYS = 2**24  # 8 bytes each
 MAX_RECORDS = 2**31 - 1  # no volume has more: level 0 alone
 
 
@@ -143,7 +145,8 @@ def render(
                 _shade_direct(launcher, scene, device_scene, plan, world, part)
             if _has_indirect(scene, plan):
                 with launcher.scope("gather"):
-                    irradiance = _irradiance(launcher, device_scene, plan, world, buffer, part)
+                    rays = _kept_rays(launcher, scene, plan, kept)
+                    irradiance = _irradiance(launcher, device_scene, plan, world, buffer, part, rays)
                     shade_indirect(
                         launcher,
                         part.points,
@@ -342,8 +345,26 @@ def _shade_direct(
     )
 
 
+def _kept_rays(launcher: Launcher, scene: Scene, plan: Plan, kept: Kept | None) -> Any:
+    """What the rays gathered at real surfaces met in the real scene; None where that is not kept."""
+    settings = plan.settings
+    blocks = -(-plan.width // settings.gather_stride) * -(-plan.height // settings.gather_stride)
+    if kept is None or settings.gather == "cones" or blocks * settings.gather_rays > MOST_KEPT_RAYS:
+        return None
+    key = content_key(
+        scene.camera, plan.width, plan.height, settings.gather_stride, settings.gather_rays, settings.seed
+    )
+    return kept.get("gathered real hits", key, lambda: keep_rays(launcher, blocks, settings.gather_rays))
+
+
 def _irradiance(
-    launcher: Launcher, scene: DeviceScene, plan: Plan, world: Any, buffer: GBuffer, part: _Part
+    launcher: Launcher,
+    scene: DeviceScene,
+    plan: Plan,
+    world: Any,
+    buffer: GBuffer,
+    part: _Part,
+    rays: Any,
 ) -> tuple[Any, Any]:
     """Irradiance before and after at the part's points: sparse for what is seen, everywhere for what is hidden."""
     settings = plan.settings
@@ -369,6 +390,7 @@ def _irradiance(
         stride=settings.gather_stride,
         radius=settings.gather_radius,
         smoothing=settings.gather_smoothing,
+        kept=rays,
     )
     if scene.synthetic is not None:
         object_before, object_after = gather_sparse(

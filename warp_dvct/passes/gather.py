@@ -31,10 +31,13 @@ class Gatherer:
     cone: Any = None
     with_before: bool = True
 
-    def run(self, launcher: Launcher, points: Any, index: Any, count: int, nearness: Any = None) -> tuple[Any, Any]:
+    def run(
+        self, launcher: Launcher, points: Any, index: Any, count: int, nearness: Any = None, kept: Any = None
+    ) -> tuple[Any, Any]:
         """Irradiance [W m^-2] before and after at points ``index`` (-1 gives 0): two vec3 ``[count]``.
 
         ``nearness``, float ``[count]``, receives the mean inverse distance of what rays met (cones leave it alone).
+        ``kept``: ``KeptRays`` of ``count`` slots (:func:`keep_rays`), for pixels' centres on real surfaces.
         """
         if nearness is None:
             nearness = launcher.empty(max(1, count), wp.float32)
@@ -44,7 +47,15 @@ class Gatherer:
             launcher.launch(
                 kernels._gather_rays,
                 count,
-                [points, index, self.scene.geometry, self.world, self.rays, self.seed],
+                [
+                    points,
+                    index,
+                    self.scene.geometry,
+                    self.world,
+                    self.rays,
+                    self.seed,
+                    kept or keep_rays(launcher, 0, 0),
+                ],
                 [before, after, nearness],
             )
         else:
@@ -64,6 +75,16 @@ class Gatherer:
                 [before, after],
             )
         return before, after
+
+
+def keep_rays(launcher: Launcher, slots: int, rays: int) -> Any:
+    """Empty ``KeptRays``; with no slots, the one that keeps nothing."""
+    kept = kernels.KeptRays()
+    kept.present = int(slots > 0)
+    kept.point = launcher.full(max(1, slots), -1, wp.int32)
+    kept.reach = launcher.empty(max(1, slots * rays), wp.float32)
+    kept.triangle = launcher.empty(max(1, slots * rays), wp.int32)
+    return kept
 
 
 def point_pixels(launcher: Launcher, buffer: GBuffer) -> Any:
@@ -88,12 +109,14 @@ def gather_sparse(
     stride: int,
     radius: int,
     smoothing: int = 0,
+    kept: Any = None,
 ) -> tuple[Any, Any]:
     """Irradiance, before and after, at every shading point of a role.
 
     One pixel of each ``stride`` x ``stride`` block is gathered; ``smoothing`` a-trous steps average the gathered values
     as far as the distance to what they see allows; the others are reconstructed from the blocks within
     ``radius`` that lie on the same surface. Points without any such block are gathered themselves.
+    ``kept``: ``KeptRays`` with a slot per block, for the role REAL.
 
     Returns:
         Two vec3 ``[buffer.count]``; 0 at points of the other role.
@@ -107,7 +130,7 @@ def gather_sparse(
         [choice],
     )
     nearness = launcher.zeros(columns * rows, wp.float32)
-    sparse = gatherer.run(launcher, buffer.points, choice, columns * rows, nearness)
+    sparse = gatherer.run(launcher, buffer.points, choice, columns * rows, nearness, kept)
     guide = reconstruction.Guide()
     guide.stride, guide.columns, guide.rows = stride, columns, rows
     guide.plane, guide.sharpness, guide.reach = PLANE_TOLERANCE, NORMAL_SHARPNESS, SMOOTH_REACH
