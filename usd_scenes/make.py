@@ -24,6 +24,8 @@ def stages() -> dict[str, str]:
     """Name and text of every stage."""
     return {
         "bunny": bunny(),
+        "colour_bleeding": colour_bleeding(),
+        "double_shadow": double_shadow(),
         "furnace": furnace(),
         "ground_dome": ground_dome(),
         "room_area": room_area(),
@@ -83,6 +85,45 @@ def room_glossy() -> str:
     )
     children = [room_camera(), ceiling_light(), room(floor="Floor"), objects, room_materials(glossy)]
     return usda.stage("room_glossy", doc, children)
+
+
+def double_shadow() -> str:
+    """A synthetic ball hangs between a lamp and a real box: the box's shadow must not be taken off twice."""
+    box = usda.box("Box", (0.5, 0.6, 0.5), (0.15, 0, -0.3), "Wood", turn=15)
+    ball = usda.role("Synthetic", "synthetic", [usda.sphere("Ball", 0.3, (-0.33, 1.12, -0.28), "White")])
+    doc = (
+        "Figures 4 and 5 of Knecht 2012: a synthetic ball between a lamp and a real box, whose shadow is there already."
+    )
+    materials = room_materials([usda.lambert("Wood", (0.5, 0.36, 0.22))])
+    lamp = spot("Light", 2600, 0.04, 32, (-1.2, 2.05, -0.25), turn=-92, pitch=-47)
+    return usda.stage("double_shadow", doc, [room_camera(), lamp, room(furniture=box), ball, materials])
+
+
+def colour_bleeding() -> str:
+    """A lamp lights a real blue block, which tints the room; a synthetic green box is put into the beam."""
+    block = usda.box("Block", (0.5, 1.3, 1.2), (1.0, 0, -0.6), "Blue")
+    objects = usda.role("Synthetic", "synthetic", [usda.box("Box", (0.3, 0.66, 0.7), (-0.75, 0, -0.6), "Leaf")])
+    doc = "Figures 6 and 14 to 16 of Knecht 2012: a synthetic box takes the light off a real one that tints the room."
+    materials = room_materials([usda.lambert("Leaf", (0.2, 0.5, 0.1))])
+    lamp = spot("Light", 9000, 0.04, 14, (-1.7, 0.6, -0.6), turn=-90, pitch=2)
+    return usda.stage("colour_bleeding", doc, [room_camera(), lamp, room(furniture=block), objects, materials])
+
+
+def spot(name: str, intensity: float, radius: float, cone: float, position: Vec3, turn: float, pitch: float) -> str:
+    """A SphereLight with a soft-edged cone of half angle ``cone`` degrees."""
+    return usda.prim(
+        "SphereLight",
+        name,
+        [
+            f"float3[] extent = {usda.array([usda.vec((-radius,) * 3), usda.vec((radius,) * 3)])}",
+            f"float inputs:intensity = {usda.number(intensity)}",
+            f"float inputs:radius = {usda.number(radius)}",
+            f"float inputs:shaping:cone:angle = {usda.number(cone)}",
+            "float inputs:shaping:cone:softness = 0.3",
+            *usda.place(position, turn=turn, pitch=pitch),
+        ],
+        apis=["ShapingAPI"],
+    )
 
 
 def ground_dome() -> str:
