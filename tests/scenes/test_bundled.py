@@ -13,7 +13,8 @@ from warp_dvct import usd_scenes
 from warp_dvct.errors import FileError, OptionError
 from warp_dvct.usd_scenes import make
 
-STAGES = ["bunny", "furnace", "ground_dome", "room_area", "room_glossy", "room_spot", "thin_wall"]
+STAGES = ["bunny", "colour_bleeding", "double_shadow", "furnace", "ground_dome"]
+STAGES += ["room_area", "room_glossy", "room_spot", "thin_wall"]
 
 
 @pytest.fixture(autouse=True)
