@@ -329,6 +329,38 @@ def test_what_did_not_change_stays_on_the_device(shot, monkeypatch):
     assert frames[4].plate.mean() == pytest.approx(0.5 * frames[3].plate.mean(), rel=0.02)
 
 
+def slid(mesh: Mesh, offset) -> Mesh:
+    return replace(mesh, points=mesh.points + np.asarray(offset, float))
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_frame_of_a_shot_equals_the_same_frame_alone(variant):
+    """Whatever moved before, and whatever was kept: objects, real things, lights, camera, plate or none."""
+    start = room(lamp(), Light(LightKind.DOME, (0.2, 0.3, 0.4)))
+    walls, ball, box = start.meshes
+    crate = lit.mesh(lit.cuboid((0.7, 0.2, 0.6), 0.06, 10.0))
+    start = replace(start, meshes=(walls, crate, ball, box))
+    nearer = lit.look_at((0.45, 0.5, 0.8), (0.5, 0.3, 0.4), half=0.6, aspect=1.5)
+    shot = [
+        start,
+        replace(start, meshes=(walls, crate, slid(ball, (0.02, 0.01, 0.0)), box)),
+        replace(start, meshes=(walls, crate, slid(ball, (-0.2, 0.2, 0.1)), box)),
+        replace(start, meshes=(walls, slid(crate, (0.0, 0.1, 0.05)), ball, box)),
+        replace(start, meshes=(walls, slid(crate, (0.0, 0.1, 0.05)), ball)),
+        replace(start, meshes=(walls, crate, ball, box), lights=(lamp(position=(0.4, 0.88, 0.5)), start.lights[1])),
+        replace(start, camera=nearer),
+        replace(start, materials=(MATERIALS[1], *MATERIALS[1:])),
+        replace(start, meshes=(walls, crate)),
+        start,
+    ]
+    relighter = Relighter(start, settings=FAST | VARIANTS[variant], **SIZE)
+    for frame, scene in enumerate(shot):
+        plate = random_plate() if frame % 3 == 1 else None
+        relighter._stage = scene
+        relighter.set_time(None)
+        assert_same_bytes(relighter.render(plate), render(scene, plate, **VARIANTS[variant]))
+
+
 def test_stats_and_progress():
     relighter = Relighter(room(), settings=FAST, **SIZE)
     calls = []

@@ -40,7 +40,7 @@ def test_a_single_occupancy_has(rows, form):
     """It cannot hold the indirect light that the objects block: an error of the order of the delta itself."""
     assert rows[form].mean > 1000 * rows["dual"].mean
     assert rows[form].rms > 0.01
-    assert rows[form].mean > 0.5 * abs(rows[form].delta / rows[form].before)
+    assert rows[form].rms > 0.5 * abs(rows[form].delta / rows[form].before)
 
 
 def test_the_delta_is_closer_to_exact_rays_with_both_occupancies(rows):
@@ -48,7 +48,6 @@ def test_the_delta_is_closer_to_exact_rays_with_both_occupancies(rows):
         assert rows["dual"].against_rays < rows[form].against_rays
     assert rows["dual"].against_rays < 0.15
     assert rows["dual"].delta < 0
-    assert abs(rows["paper"].delta) < 0.5 * abs(rows["dual"].delta), "mip-averaged objects hardly block"
 
 
 def test_table_has_a_line_per_form(rows):
