@@ -214,6 +214,31 @@ def _sweep(stage: str, trials: Any, spp: int, pairs: tuple[str, ...], json_file:
         write_json(json_file, content)
 
 
+@bench.command()
+@click.option("--stage", default="room_area", show_default=True, help="A bundled stage or a USD file.")
+@click.option("--frames", type=int, default=60, show_default=True, help="Of the shot.")
+@click.option("--light", is_flag=True, help="Move a light instead of the synthetic objects.")
+@click.option("--quality", default="balanced", show_default=True)
+@click.option("--width", type=int, default=640, show_default=True, help="Pixels; the height follows the camera.")
+@click.option("--checks", type=int, default=3, show_default=True, help="Frames compared with frames from scratch.")
+@click.option("--flicker", type=int, default=5, show_default=True, help="Frames to measure flicker on; 0 for none.")
+@click.option("--flicker-width", type=int, default=320, show_default=True, help="Pixels, where flicker is measured.")
+@click.option("--spp", type=int, default=64, show_default=True, help="Samples per pixel of the flicker's truth.")
+@click.option("--cache", type=click.Path(path_type=Path), help="References; default: warp_dvct in the user's cache.")
+@_shared
+def motion(stage: str, pairs: tuple[str, ...], json_file: Path | None, spp: int, cache: Path | None, **rest: Any):
+    """A moving shot: frames a second, what is kept between frames, equality with frames from scratch, flicker."""
+    start_warp(rest["device"])
+    from warp_dvct.bench import motion as module
+
+    cache = cache or cache_folder() / "references"
+    options = module.MotionOptions(settings=settings_of(pairs), samples=spp, cache=cache, **rest)
+    report = module.measure(stage, options)
+    click.echo(module.format_report(report))
+    if json_file is not None:
+        write_json(json_file, {"options": asdict(options), "report": asdict(report)})
+
+
 def settings_of(pairs: tuple[str, ...]) -> dict[str, str]:
     """``key=value`` strings as a dict.
 

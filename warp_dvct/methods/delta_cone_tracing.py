@@ -136,6 +136,7 @@ def render(
     before = launcher.zeros(buffer.count if with_before else 1, wp.vec3)
     hidden_before = launcher.zeros(max(1, buffer.behind_count), wp.vec3)
     if plan.changes or with_before:
+        rays = _kept_rays(launcher, scene, plan, kept) if _has_indirect(scene, plan) else None
         parts = [_Part(buffer.points, buffer.count, light, before, with_before)]
         if with_before:
             spare = launcher.zeros(max(1, buffer.behind_count), wp.vec3)
@@ -145,7 +146,6 @@ def render(
                 _shade_direct(launcher, scene, device_scene, plan, world, part)
             if _has_indirect(scene, plan):
                 with launcher.scope("gather"):
-                    rays = _kept_rays(launcher, scene, plan, kept)
                     irradiance = _irradiance(launcher, device_scene, plan, world, buffer, part, rays)
                     shade_indirect(
                         launcher,

@@ -1,0 +1,206 @@
+"""Moving shots: every frame equals the frame from scratch bit for bit, and what is static is kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import lit_scenes as lit
+import numpy as np
+import pytest
+
+from warp_dvct.bench.motion import flicker_of, same, shot
+from warp_dvct.errors import OptionError
+from warp_dvct.frame import volume_frame
+from warp_dvct.kept import Kept
+from warp_dvct.relighter import Relighter
+from warp_dvct.scene import Camera, Light, LightKind, LightRole, Material, Role
+
+SMALL = {
+    "volume.resolution": 40,
+    "volume.coarse": 20,
+    "rsm.texels": 64,
+    "gather.rays": 8,
+    "gather.object_rays": 8,
+    "shadows.samples": 4,
+    "shadows.probes": 2,
+    "patches.count": 200,
+    "patches.rays": 8,
+    "glossy.rays": 2,
+    "bounces": 3,
+}
+SHINY = Material(base_color=(0.6, 0.5, 0.4), roughness=0.3)
+LAMP = Light(
+    LightKind.RECT,
+    (8.0, 7.0, 6.0),
+    position=(0.5, 0.94, 0.5),
+    axis_x=(0.15, 0, 0),
+    axis_y=(0, 0, 0.15),
+    direction=(0, -1, 0),
+    path="/World/Lamp",
+)
+BULB = Light(LightKind.POINT, (0.2, 0.2, 0.3), position=(0.25, 0.6, 0.7), role=LightRole.ADDED, path="/World/Bulb")
+
+
+def scene(offset=(0.0, 0.0, 0.0), *, bulb=(0.0, 0.0, 0.0), lights=2, material=lit.GREY, camera_x=0.5):
+    middle = np.array([0.5, 0.3, 0.5]) + offset
+    parts = [lit.mesh(lit.room(0.45)), lit.mesh(lit.cuboid((0.25, 0.15, 0.3), 0.08))]
+    parts += [
+        lit.mesh(lit.cuboid(middle, 0.1), Role.SYNTHETIC),
+        lit.mesh(lit.ball(middle + 0.15, 0.06, 12), Role.SYNTHETIC),
+    ]
+    to_world = np.eye(4)
+    to_world[:3, 3] = (camera_x, 0.5, 0.93)
+    moved = replace(BULB, position=tuple(np.array(BULB.position) + bulb))
+    made = lit.scene_of(*parts, lights=(LAMP, moved)[:lights], materials=(material,))
+    return replace(made, camera=Camera(to_world, -0.8, 0.8, -0.6, 0.6, path="/World/Camera"))
+
+
+def relighter(of, threads=2, **overrides) -> Relighter:
+    settings = {**SMALL, **{k.replace("__", "."): v for k, v in overrides.items()}}
+    return Relighter(of, settings=settings, width=64, height=48, threads=threads)
+
+
+@pytest.fixture(scope="module")
+def plate() -> np.ndarray:
+    return np.ascontiguousarray(relighter(scene()).render().plate)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("material", [lit.GREY, SHINY], ids=["matte", "glossy"])
+def test_frames_of_a_random_walk_equal_frames_from_scratch(plate, threads, material):
+    """Small steps that keep the box, and large ones that move it; with two lights, one of them added."""
+    rng = np.random.default_rng(4)
+    moving = relighter(scene(material=material), threads)
+    moving.render(plate)
+    last, kept = None, []
+    for step in (0.004, 0.01, 0.01, 0.1, 0.01):
+        moment = scene(rng.uniform(-step, step, 3), material=material)
+        moving.set_scene(moment)
+        frame = moving.render(plate)
+        assert same(frame, relighter(moment, 3 - threads).render(plate)), "another number of threads, from scratch"
+        assert last is None or not np.array_equal(frame.comp, last.comp), "the object moved"
+        last = frame
+        kept.append(moving.stats["kept"])
+    assert any(all(k.values()) for k in kept), kept
+
+
+def test_without_a_plate_and_with_a_moving_camera():
+    moving = relighter(scene())
+    for k in range(3):
+        moment = scene((0.004 * k, 0.0, 0.0), camera_x=0.5 + 0.01 * (k // 2))
+        moving.set_scene(moment)
+        assert same(moving.render(), relighter(moment).render())
+    kept = moving.stats["kept"]
+    assert not kept["camera's real hits"], "the camera moved"
+    assert not kept["gathered real hits"]
+    assert kept["real fragments, fine volume"], "the room did not"
+
+
+def test_a_moving_light_leaves_geometry_and_the_other_light():
+    moving = relighter(scene())
+    moving.render()
+    moment = scene(bulb=(0.02, 0.0, 0.0))
+    moving.set_scene(moment)
+    assert same(moving.render(), relighter(moment).render())
+    kept = moving.stats["kept"]
+    assert {name.split(",")[0] for name, reused in kept.items() if not reused} == {"real map of light 1"}
+
+
+def test_cones_read_all_levels(plate):
+    moving = relighter(scene(), gather="cones")
+    moving.render(plate)
+    moment = scene((0.004, 0.0, 0.003))
+    moving.set_scene(moment)
+    assert same(moving.render(plate), relighter(moment, gather="cones").render(plate))
+
+
+def test_real_geometry_that_moves_is_not_kept(plate):
+    moving = relighter(scene())
+    moving.render(plate)
+    still = scene()
+    moment = replace(
+        still,
+        meshes=(still.meshes[0], replace(still.meshes[1], points=still.meshes[1].points + 0.01), *still.meshes[2:]),
+    )
+    moving.set_scene(moment)
+    assert same(moving.render(plate), relighter(moment).render(plate))
+    assert not any(moving.stats["kept"].values())
+
+
+def test_set_scene_needs_a_scene(tmp_path):
+    from warp_dvct.usd_scenes import path
+
+    with pytest.raises(OptionError, match="set_time"):
+        Relighter(path("furnace"), width=16).set_scene(scene())
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.5, 2.0, 5.0])
+def test_the_box_goes_in_steps_and_holds_the_objects(scale):
+    """Its edge is within 9 % of what was asked for (more only to hold the objects), its middle within a sixteenth."""
+    rng = np.random.default_rng(1)
+    frames = set()
+    for _ in range(200):
+        moment = scene(rng.uniform(-0.05, 0.05, 3))
+        low, high = moment.bounds(Role.SYNTHETIC)
+        frame = volume_frame(moment, scale)
+        assert (low >= frame.origin - 1e-12).all()
+        assert (high <= frame.origin + frame.edge + 1e-12).all()
+        asked = scale * (high - low).max()
+        assert frame.edge > asked * 0.917
+        assert frame.edge < max(asked * 1.091, (high - low).max() * 8 / 7 * 1.19)
+        assert (np.abs(frame.origin + 0.5 * frame.edge - 0.5 * (low + high)) <= frame.edge / 16 + 1e-12).all()
+        np.testing.assert_allclose(frame.origin + frame.low * frame.edge, 0.05, atol=1e-12)
+        frames.add((*frame.origin, frame.edge, *frame.low, *frame.high))
+    assert len(frames) < 60
+
+
+def test_objects_outside_of_the_real_scene_are_in_the_coarse_volume():
+    ground = lit.mesh(lit.rectangle((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)))
+    above = lit.scene_of(ground, lit.mesh(lit.cuboid((0.5, 0.1003, 0.5), 0.1), Role.SYNTHETIC))
+    frame = volume_frame(above, 2.0)
+    low, high = above.bounds()
+    assert (frame.origin + frame.low * frame.edge <= low + 1e-12).all()
+    assert (frame.origin + frame.high * frame.edge >= high - 1e-12).all()
+
+
+def test_kept_results_are_replaced_by_key_and_dropped_with_the_real_scene():
+    kept, made = Kept(), []
+
+    def make(value):
+        made.append(value)
+        return value
+
+    kept.set_real("room")
+    assert [kept.get("a", k, lambda k=k: make(k)) for k in (1, 1, 2)] == [1, 1, 2]
+    assert kept.reused == {"a": False}
+    kept.set_real("room")
+    assert kept.get("a", 2, lambda: make(3)) == 2
+    assert kept.reused == {"a": True}
+    kept.set_real("hall")
+    assert kept.get("a", 2, lambda: make(4)) == 4
+    assert made == [1, 2, 4]
+
+
+def test_shot_moves_objects_or_a_light_and_nothing_else():
+    still = scene()
+    for moment in shot(still, 8, False)[1:]:
+        offsets = [b.points - a.points for a, b in zip(still.meshes, moment.meshes, strict=True)]
+        assert not offsets[0].any()
+        assert not offsets[1].any()
+        assert np.ptp(offsets[2], 0).max() < 1e-12
+        assert abs(offsets[2][0, 1]) < 1e-12, "the camera's up is y"
+        assert moment.lights is still.lights
+    assert {m.lights[0].position for m in shot(still, 8, True)} != {LAMP.position}
+    with pytest.raises(OptionError, match="no light"):
+        shot(replace(still, lights=()), 8, True)
+    with pytest.raises(OptionError, match="at least 2"):
+        shot(still, 1, False)
+
+
+def test_flicker_of_a_steady_error_is_nothing():
+    rng = np.random.default_rng(0)
+    truths = [rng.uniform(0.2, 0.6, (32, 48, 3)).astype(np.float32) for _ in range(3)]
+    steady = [t + np.float32(0.1) for t in truths]
+    noisy = [t + rng.normal(0, 0.05, t.shape).astype(np.float32) for t in truths]
+    assert flicker_of(steady, truths) < 1e-3
+    assert flicker_of(noisy, truths) > 0.05
