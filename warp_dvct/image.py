@@ -54,6 +54,23 @@ def write_exr(
             raise FileError(f"{path} cannot be written: {error}") from error
 
 
+def write_radiance(path: str | Path, pixels: np.ndarray) -> None:
+    """Write linear RGB ``[h, w, 3]`` as a 32-bit EXR: the sun does not fit into half floats.
+
+    Raises:
+        FileError: The file cannot be written; nothing is left behind.
+    """
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with _replacing(Path(path)) as temporary:
+        try:
+            with OpenEXR.File(header, {"RGB": np.ascontiguousarray(pixels, np.float32)}) as file:
+                file.write(str(temporary))
+        except (RuntimeError, OSError) as error:
+            raise FileError(f"{path} cannot be written: {error}") from error
+
+
 def exr_channels(layers: Layers) -> dict[str, np.ndarray]:
     """The channels of :func:`write_exr` by name, float16 or float32, each ``[h, w]``."""
     channels = _planes("", "RGBA", layers.rgba)

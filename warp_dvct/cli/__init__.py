@@ -13,6 +13,7 @@ from types import FrameType
 import click
 
 from warp_dvct.cli.plan import plan
+from warp_dvct.cli.probe import probe
 from warp_dvct.cli.relight import relight
 from warp_dvct.cli.scenes import scenes
 from warp_dvct.cli.settings import settings
@@ -29,7 +30,7 @@ def cli() -> None:
     """Insert synthetic objects into real scenes with physically convincing light."""
 
 
-for command in (relight, plan, settings, scenes, warmup):
+for command in (relight, plan, probe, settings, scenes, warmup):
     cli.add_command(command)
 
 
