@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from warp_dvct.bench.error import read, stage_file
-from warp_dvct.bench.references import Reference, ReferenceStore, combine
+from warp_dvct.bench.references import Reference, ReferenceStore, combine, is_glossy
 from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher
 from warp_dvct.layers import Layers
@@ -69,7 +69,8 @@ class Trial:
         flip, flip_affected: Mean LDR-FLIP over the picture and over affected pixels.
         delta_error: Root mean square error of the change of indirect light on real pixels, over the mean of
             indirect light before.
-        energy_before, energy_after: Indirect light of the whole picture over the truth's.
+        energy_before, energy_after: Indirect light over the truth's: of the whole picture, or of ``Truth.real`` where
+            the scene has glossy surfaces.
     """
 
     name: str
@@ -101,13 +102,16 @@ class Truth:
 
     Attributes:
         whole: One bounce. parts: Its indirect light, twice. noise: FLIP that the noise of ``whole`` is worth.
-        real, affected: Pixels without synthetic coverage; pixels that the synthetic objects change.
+        real: Pixels without synthetic coverage whose surface is not glossy: a glossy one mirrors lit surfaces even in
+            the frame of direct light that indirect light is the difference to.
+        counted: Pixels whose energy is compared. affected: Pixels that the synthetic objects change.
     """
 
     whole: Reference
     parts: tuple[Indirect, Indirect]
     noise: float
     real: np.ndarray
+    counted: np.ndarray
     affected: np.ndarray
 
 
@@ -121,7 +125,7 @@ def truth_of(scene: Scene, width: int, height: int, options: SweepOptions, launc
         raise OptionError(f"the picture is {width} x {height}; FLIP needs at least 16 pixels, raise --width")
     if options.samples < 2:
         raise OptionError(f"--spp is {options.samples}; give at least 2, the truth is traced in two parts")
-    ones, indirect = [], []
+    ones, indirect, glossy = [], [], np.zeros((height, width), bool)
     for seed in (options.seed, options.seed + 1):
         store = ReferenceStore(
             scene,
@@ -132,7 +136,7 @@ def truth_of(scene: Scene, width: int, height: int, options: SweepOptions, launc
             cache=options.cache,
             launcher=launcher,
         )
-        direct, one = store.get(0), store.get(1)
+        direct, one, glossy = store.get(0), store.get(1), store.glossy_mask()
         ones.append(one)
         indirect.append(
             Indirect(one.before - direct.before, one.delta - direct.delta, (one.synthetic - direct.synthetic)[..., :3])
@@ -142,7 +146,9 @@ def truth_of(scene: Scene, width: int, height: int, options: SweepOptions, launc
     noise = flip_ldr(combine(before, a.delta, a.synthetic), combine(before, b.delta, b.synthetic))[0] / 2
     whole = Reference(before, delta, synthetic, noise)
     affected = affected_mask(smooth_delta(delta, whole.coverage), whole.coverage)
-    return Truth(whole, (indirect[0], indirect[1]), noise, whole.coverage <= 0, affected)
+    real = (whole.coverage <= 0) & ~glossy
+    counted = real if any(is_glossy(m) for m in scene.materials) else np.ones_like(real)
+    return Truth(whole, (indirect[0], indirect[1]), noise, real, counted, affected)
 
 
 def measure(
@@ -207,14 +213,15 @@ def compare_indirect(truth: Truth, found: Indirect) -> tuple[float, float, float
     The mean squared error is taken as the mean of (found - part 1)(found - part 2): with independent noise in the parts
     its expectation is the error against a truth without noise. It is 0 where that is negative.
     """
-    coverage, real, parts = truth.whole.coverage, truth.real, truth.parts
+    coverage, real, counted, parts = truth.whole.coverage, truth.real, truth.counted, truth.parts
     first, second = (found.delta[real] - part.delta[real] for part in parts)
     mean_square = float((first.astype(np.float64) * second).mean())
     scale = float(np.mean([part.before[real].mean() for part in parts]))
-    before = float(np.mean([part.before.mean() for part in parts]))
-    after = float(np.mean([part.after(coverage).mean() for part in parts]))
+    before = float(np.mean([part.before[counted].mean() for part in parts]))
+    after = float(np.mean([part.after(coverage)[counted].mean() for part in parts]))
     error = float(np.sqrt(max(mean_square, 0.0))) / max(scale, 1e-12)
-    return error, float(found.before.mean()) / before, float(found.after(coverage).mean()) / after
+    found_before, found_after = (float(p[counted].mean()) for p in (found.before, found.after(coverage)))
+    return error, found_before / before, found_after / after
 
 
 def _relighter(scene: Scene, settings: Mapping[str, str], options: SweepOptions, width: int, height: int | None) -> Any:

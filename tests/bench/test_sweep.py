@@ -35,7 +35,7 @@ def made_truth(noise: float) -> tuple[Truth, Indirect]:
         for _ in range(2)
     ]
     whole = Reference(exact.before, exact.delta, np.concatenate([exact.synthetic, coverage[..., None]], -1), 0.0)
-    return Truth(whole, (parts[0], parts[1]), 0.0, coverage <= 0, coverage >= 0), exact
+    return Truth(whole, (parts[0], parts[1]), 0.0, coverage <= 0, coverage >= 0, coverage >= 0), exact
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
@@ -67,6 +67,18 @@ def test_indirect_truth_is_the_bounce_alone(cache, launcher):
     np.testing.assert_array_equal(
         truth.whole.comp, combine(truth.whole.before, truth.whole.delta, truth.whole.synthetic)
     )
+
+
+def test_glossy_pixels_are_left_out_of_the_indirect_light(cache, launcher):
+    """The frame of direct light mirrors lit surfaces in the floor: only the walls' indirect light is compared."""
+    from warp_dvct.bench.error import read
+    from warp_dvct.usd_scenes import path
+
+    options = SweepOptions(width=WIDTH, samples=SPP, cache=cache)
+    truth = module.truth_of(read(path("room_glossy")), WIDTH, 36, options, launcher)
+    assert truth.real[4].mean() > 0.9  # back wall
+    assert not truth.real[-1].any()  # floor
+    np.testing.assert_array_equal(truth.counted, truth.real)
 
 
 def test_more_of_everything_lowers_the_error(cache):
