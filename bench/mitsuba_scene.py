@@ -148,5 +148,5 @@ def _emitter(mi: Any, light: Light) -> dict[str, Any]:
         return {"type": "constant", "radiance": rgb}
     turn = np.eye(4)
     turn[:3, :3] = light.rotation
-    pixels = mi.Bitmap(np.ascontiguousarray(light.texture * np.float32(light.radiance)))
+    pixels = mi.Bitmap(np.ascontiguousarray(light.texture * np.asarray(light.radiance, np.float32)))
     return {"type": "envmap", "bitmap": pixels, "to_world": transform(turn)}

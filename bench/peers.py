@@ -153,7 +153,9 @@ def _add_mitsuba(
         left_out.append(f"Intel Open Image Denoise: {error}; pip install 'warp-dvct[bench]'")
     with tempfile.TemporaryDirectory() as folder:
         try:
-            plain, with_guides = (MitsubaPair(mi, scene, truth, Path(folder), options.bounces, g) for g in (0, 1))
+            plain, with_guides = (
+                MitsubaPair(mi, scene, truth, Path(folder), options.bounces, g) for g in (False, True)
+            )
         except OptionError as error:
             return [*left_out, f"Mitsuba 3: {error}"], ""
         for samples in options.peer_samples:
@@ -202,7 +204,7 @@ class MitsubaPair:
     def __init__(self, mi: Any, scene: Scene, truth: Reference, folder: Path, bounces: int, guides: bool) -> None:
         self._mi, self._truth, self._guides = mi, truth, guides
         height, width = truth.coverage.shape
-        size = {"width": width, "height": height, "bounces": bounces, "aov": bool(guides)}
+        size = {"width": width, "height": height, "bounces": bounces, "aov": guides}
         self._scenes = [
             mi.load_dict(mitsuba_description(mi, scene, roles, folder, **size)) for roles in ((Role.REAL,), tuple(Role))
         ]
