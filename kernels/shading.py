@@ -5,7 +5,7 @@ import warp as wp
 from warp_dvct.kernels.cones import ConeSettings, march_cone
 from warp_dvct.kernels.gbuffer import BACKGROUND, SYNTHETIC, Points, load_surface
 from warp_dvct.kernels.geometry import Geometry, occluded_by_real, occluded_by_synthetic
-from warp_dvct.kernels.lights import ADDED, DISTANT, DOME, Lights, LightSample, sample_light
+from warp_dvct.kernels.lights import ADDED, DISK, DISTANT, DOME, RECT, Lights, LightSample, sample_light
 from warp_dvct.kernels.materials import (
     Surface,
     brdf_cos_diffuse,
@@ -19,6 +19,7 @@ from warp_dvct.kernels.volume import Volume
 
 wp.set_module_options({"enable_backward": False})
 
+UNLIT_MARGIN = wp.constant(1.0e-4)  # of a distance or cosine: keeps rounding from culling a light at the horizon
 SHADOW_END = wp.constant(0.9999)  # of the way to the light: a surface that the light lies on does not shadow it
 
 
@@ -117,6 +118,30 @@ def look(geo: Geometry, origin: wp.vec3, direction: wp.vec3, reach: float, need_
 
 
 @wp.func
+def unlit(lights: Lights, k: int, s: Surface) -> bool:
+    """Whether a light lies wholly behind a surface, or emits away from it: it then sends nothing, whatever is between."""
+    if lights.kind[k] == DISTANT:
+        # cos(90 degrees + spread) = -sin(spread), and sin^2 = cap (2 - cap)
+        cap = lights.cap[k]
+        return -wp.dot(lights.direction[k], s.normal_g) < -wp.sqrt(wp.max(cap * (2.0 - cap), 0.0)) - UNLIT_MARGIN
+    to_light = lights.position[k] - s.position
+    bound = lights.radius[k] + wp.length(lights.axis_x[k]) + wp.length(lights.axis_y[k])
+    margin = UNLIT_MARGIN * (bound + wp.length(to_light))
+    if wp.dot(to_light, s.normal_g) < -bound - margin:
+        return True
+    planar = lights.kind[k] == RECT or lights.kind[k] == DISK
+    return planar and wp.dot(to_light, lights.direction[k]) > margin
+
+
+@wp.func
+def meets_objects(origin: wp.vec3, direction: wp.vec3, reach: float, direct: Direct) -> bool:
+    """Whether a ray passes the synthetic objects' bounding sphere: much cheaper to ask than their triangles."""
+    to_center = direct.center - origin
+    along = wp.clamp(wp.dot(to_center, direction), 0.0, reach)
+    return wp.length_sq(to_center - direction * along) <= direct.radius * direct.radius
+
+
+@wp.func
 def untouched(s: Surface, wo: wp.vec3, i: int, geo: Geometry, lights: Lights, k: int, direct: Direct) -> bool:
     """Whether the probes of ``light_part`` meet no synthetic object: the light then does not change, to the last bit.
 
@@ -129,8 +154,11 @@ def untouched(s: Surface, wo: wp.vec3, i: int, geo: Geometry, lights: Lights, k:
         if not lit:
             f = reflected(s, wo, light, direct)
             lit = wp.max(f[0], wp.max(f[1], f[2])) > 0.0
-        if occluded_by_synthetic(geo, spawn_point(s, light.direction), light.direction, light.distance * SHADOW_END):
-            return False
+        origin = spawn_point(s, light.direction)
+        reach = light.distance * SHADOW_END
+        if meets_objects(origin, light.direction, reach, direct):
+            if occluded_by_synthetic(geo, origin, light.direction, reach):
+                return False
         count += 1
         if light.pdf <= 0.0:
             return True
@@ -231,7 +259,7 @@ def _shade_direct(
     total = wp.vec3(0.0, 0.0, 0.0)
     before = wp.vec3(0.0, 0.0, 0.0)
     for k in range(lights.count):
-        if lights.kind[k] != DOME:
+        if lights.kind[k] != DOME and not unlit(lights, k, s):
             added = lights.role[k] == ADDED
             shadowed = may_shadow(lights, k, s.position, direct)
             if role == SYNTHETIC or added or direct.with_before != 0 or shadowed:
