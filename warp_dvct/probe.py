@@ -115,12 +115,12 @@ def to_latlong(image: np.ndarray, layout: str, *, height: int | None = None, len
         return np.asarray(image, np.float32)
     if layout == "fisheye":
         _check_lens(lens)
-    height = height or min(rows, columns)
-    total = np.zeros((height, 2 * height, 3))
+    size = height or min(rows, columns)
+    total = np.zeros((size, 2 * size, 3))
     for i in range(SUBSAMPLES):
         for j in range(SUBSAMPLES):
-            y, x = np.mgrid[0:height, 0 : 2 * height]
-            d = directions(height, 2 * height, y + (i + 0.5) / SUBSAMPLES, x + (j + 0.5) / SUBSAMPLES)
+            y, x = np.mgrid[0:size, 0 : 2 * size]
+            d = directions(size, 2 * size, y + (i + 0.5) / SUBSAMPLES, x + (j + 0.5) / SUBSAMPLES)
             u, v, seen = _place(d, layout, rows, columns, lens)
             total += _bilinear(image, u, v) * seen[..., None]
     return (total / SUBSAMPLES**2).astype(np.float32)

@@ -16,6 +16,7 @@ from warp_dvct.launch import Launcher
 from warp_dvct.layers import Layers, Radiance
 from warp_dvct.methods import delta_cone_tracing, instant_radiosity, path_tracing
 from warp_dvct.passes.composite import composite
+from warp_dvct.passes.difference import tonemap_difference
 from warp_dvct.plan import Plan, make_plan
 from warp_dvct.scene import Notice, Role, Scene
 from warp_dvct.settings import make_settings
@@ -81,6 +82,7 @@ class Relighter:
         self._size = (width, height)
         self._uploaded: tuple[str, DeviceScene, Lit | None] | None = None
         self._kept = Kept()
+        self._had_plate = False
         self._method_notices: tuple[Notice, ...] = ()
         self.stats: dict[str, Any] = {}
         self.load_seconds = 0.0
@@ -97,7 +99,7 @@ class Relighter:
             self.scene = read_stage(self._stage, time=time, **self._reading)
         self.load_seconds = clock.perf_counter() - start
         self.width, self.height = self._picture_size()
-        self._plan(has_plate=self.scene.plate is not None)
+        self._plan(has_plate=self.scene.plate is not None or self._had_plate)
 
     def set_scene(self, scene: Scene) -> None:
         """Render another moment of the shot from now on; what did not change stays on the device.
@@ -132,11 +134,13 @@ class Relighter:
         launcher.reset_times()
         compiled = launcher.compile_seconds
         start = clock.perf_counter()
-        self._plan(has_plate=plate is not None)
+        self._had_plate = plate is not None
+        if self._planned_plate != self._had_plate:
+            self._plan(has_plate=self._had_plate)
         if self.method == "path-trace":
             radiance = self._path_trace(report)
         elif self.method == "instant-radiosity":
-            radiance = self._instant_radiosity(plate is None, report)
+            radiance = self._instant_radiosity(plate, report)
         else:
             radiance = self._delta_cones(plate is None, report)
         report("composite", 0.95)
@@ -157,6 +161,7 @@ class Relighter:
         return layers
 
     def _plan(self, *, has_plate: bool) -> None:
+        self._planned_plate = has_plate
         self._current_plan = make_plan(
             self.scene, self.settings, self.method, self.width, self.height, has_plate=has_plate
         )
@@ -215,7 +220,7 @@ class Relighter:
             launcher, scene, device_scene, light_field, plan, with_before=with_before, kept=self._kept
         )
 
-    def _instant_radiosity(self, with_before: bool, report: Progress) -> Radiance:
+    def _instant_radiosity(self, plate: np.ndarray | None, report: Progress) -> Radiance:
         report("virtual point lights", 0.0)
         launcher, scene, plan = self._launcher, self.scene, self.plan
         device_scene, lights = self._lit(
@@ -224,7 +229,11 @@ class Relighter:
         )
         self._method_notices = lights.notices
         report("shading", 0.3)
-        return instant_radiosity.render(launcher, scene, device_scene, lights, plan, with_before=with_before)
+        tonemapped = plate is not None and plan.settings.difference == "tonemapped" and plan.changes
+        radiance = instant_radiosity.render(
+            launcher, scene, device_scene, lights, plan, with_before=plate is None or tonemapped
+        )
+        return tonemap_difference(launcher, radiance, plate) if plate is not None and tonemapped else radiance
 
     def _path_trace(self, report: Progress) -> Radiance:
         device_scene = self._device_scene()
