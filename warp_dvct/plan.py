@@ -236,13 +236,18 @@ def _volume_bytes(scene: Scene, box: Box, scale: float, origin: np.ndarray) -> i
     """About what a lit volume keeps: records for the surface inside, and the bricks around them."""
     area = 0.0
     for mesh in scene.meshes:
-        corners = (mesh.points[mesh.triangles] - origin) * scale - np.asarray(box.low)
-        middle = corners.mean(1)
-        inside = np.all((middle >= 0) & (middle <= box.edge), -1)
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area += float(0.5 * np.linalg.norm(cross, axis=-1)[inside].sum())
-        crossing = ~inside & np.all(corners.min(1) <= box.edge, -1) & np.all(corners.max(1) >= 0, -1)
-        area += min(float(0.5 * np.linalg.norm(cross, axis=-1)[crossing].sum()), 2.0 * box.edge**2 * crossing.sum())
+        # Coordinates apart ([3, t]): three times as fast as [t, 3], and this runs for every frame.
+        points = ((mesh.points - origin) * scale - np.asarray(box.low)).T
+        a, b, c = (points[:, mesh.triangles[:, k]] for k in range(3))
+        u, v = b - a, c - a
+        cross = (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
+        size = 0.5 * np.sqrt(cross[0] ** 2 + cross[1] ** 2 + cross[2] ** 2)
+        middle = (a + b + c) / 3.0
+        inside = np.all((middle >= 0) & (middle <= box.edge), 0)
+        low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+        crossing = ~inside & np.all(low <= box.edge, 0) & np.all(high >= 0, 0)
+        area += float(size[inside].sum())
+        area += min(float(size[crossing].sum()), 2.0 * box.edge**2 * int(crossing.sum()))
     records = 1.5 * area / box.voxel**2 * 4.0 / 3.0
     bricks = records / 64.0
     return int(records * RECORD_BYTES + bricks * 2048 + 4 * sum(level_bricks(box.n, k) ** 3 for k in range(1)))
