@@ -155,6 +155,8 @@ def _render_real(
     light: int,
     size: int,
     seed: int,
+    origin_out: wp.array(dtype=wp.vec3),
+    direction_out: wp.array(dtype=wp.vec3),
     reach_out: wp.array(dtype=wp.float32),
     position_out: wp.array(dtype=wp.vec3),
     normal_out: wp.array(dtype=wp.vec3),
@@ -163,11 +165,13 @@ def _render_real(
 ):
     """One texel: reflected flux where the beam first meets anything real; role 0, or -1 where it meets nothing.
 
-    ``reach_out`` is the beam's length.
+    ``origin_out``, ``direction_out`` and ``reach_out`` are the beam and its length.
     """
     i = first + wp.tid()
     beam = emit_beam(lights, light, target, i % size, i / size, size, seed)
     hit = trace_real(geo, beam.origin, beam.direction, FAR)
+    origin_out[i] = beam.origin
+    direction_out[i] = beam.direction
     reach_out[i] = hit.t
     role_out[i] = -1
     if hit.found != 0:
@@ -188,6 +192,8 @@ def _render_after(
     light: int,
     size: int,
     seed: int,
+    origin_in: wp.array(dtype=wp.vec3),
+    direction_in: wp.array(dtype=wp.vec3),
     reach_in: wp.array(dtype=wp.float32),
     position_in: wp.array(dtype=wp.vec3),
     normal_in: wp.array(dtype=wp.vec3),
@@ -200,10 +206,10 @@ def _render_after(
 ):
     """One texel: reflected flux where the beam first meets anything; role 1 where that is synthetic."""
     i = first + wp.tid()
-    beam = emit_beam(lights, light, target, i % size, i / size, size, seed)
-    hit = trace_synthetic(geo, beam.origin, beam.direction, reach_in[i])
+    hit = trace_synthetic(geo, origin_in[i], direction_in[i], reach_in[i])
     role = role_in[i]
     if hit.found != 0:
+        beam = emit_beam(lights, light, target, i % size, i / size, size, seed)
         s = surface_at(geo, mats, hit, beam.origin, beam.direction)
         role = 1
         position_out[i] = s.position

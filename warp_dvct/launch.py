@@ -82,7 +82,7 @@ class Launcher:
 
     def _launch_slabs(self, kernel, waiting: deque[int], slab: int, count: int, inputs, outputs) -> None:
         """Take slabs until none is left. A recorded launch costs a fifth of a new one, and both hold Python's lock."""
-        command = wp.launch(
+        command: Any = wp.launch(
             kernel, dim=slab, inputs=[0, *inputs], outputs=list(outputs), device=self.device, record_cmd=True
         )
         while True:

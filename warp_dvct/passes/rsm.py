@@ -36,9 +36,12 @@ class ShadowMaps:
 
 @dataclass(frozen=True)
 class RealMap:
-    """What a light's beams meet in the real scene: as in :class:`ShadowMaps`, and float ``reach``, how far they go."""
+    """What a light's beams meet in the real scene: as in :class:`ShadowMaps`; ``origin`` and ``direction`` of
+    the beams, vec3, and ``reach``, float, how far they go."""
 
     size: int
+    origin: Any
+    direction: Any
     reach: Any
     position: Any
     normal: Any
@@ -60,7 +63,8 @@ def render_real(
     """The part of :func:`render_rsm` that does not depend on synthetic objects; the arguments are the same."""
     target = _target(center, radius, start)
     count = size * size
-    arrays = [launcher.empty(count, dtype) for dtype in (wp.float32, wp.vec3, wp.vec3, wp.vec3, wp.int32)]
+    dtypes = (wp.vec3, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.vec3, wp.int32)
+    arrays = [launcher.empty(count, dtype) for dtype in dtypes]
     shared = [scene.geometry, scene.materials, scene.lights, target, light, size, seed]
     launcher.launch(kernels._render_real, count, shared, arrays)
     return RealMap(size, *arrays)
@@ -99,7 +103,7 @@ def render_rsm(
     if scene.synthetic is not None:
         after = [launcher.empty(count, dtype) for dtype in (wp.vec3, wp.vec3, wp.vec3, wp.int32)]
         shared = [scene.geometry, scene.materials, scene.lights, _target(center, radius, start), light, size, seed]
-        launcher.launch(kernels._render_after, count, [*shared, real.reach, *alone], after)
+        launcher.launch(kernels._render_after, count, [*shared, real.origin, real.direction, real.reach, *alone], after)
     return ShadowMaps(size, *after, *before)
 
 
