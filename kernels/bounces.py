@@ -99,6 +99,20 @@ class Patches:
     albedo: wp.array(dtype=wp.vec3)
     reach: wp.array(dtype=wp.float32)
     real: wp.array(dtype=wp.int32)
+    place: wp.array(dtype=wp.int64)  # key of the voxel * 6 + face: ascending, and the same whatever else is there
+
+
+@wp.struct
+class PatchHits:
+    """What the rays of an earlier frame's patches met in the real scene."""
+
+    count: wp.int32  # patches
+    place: wp.array(dtype=wp.int64)
+    position: wp.array(dtype=wp.vec3)
+    normal: wp.array(dtype=wp.vec3)
+    reach: wp.array(dtype=wp.float32)
+    distance: wp.array(dtype=wp.float32)  # [count * rays]
+    triangle: wp.array(dtype=wp.int32)  # [count * rays], -1 where a ray meets nothing
 
 
 @wp.kernel
@@ -108,6 +122,7 @@ def _choose_patches(
     mats: Materials,
     normal_in: wp.array(dtype=wp.vec3),
     face_key_in: wp.array(dtype=wp.int32),
+    level_key_in: wp.array(dtype=wp.int32),
     start_in: wp.array(dtype=wp.int32),
     face_order_in: wp.array(dtype=wp.int32),
     entries: int,
@@ -160,6 +175,7 @@ def _choose_patches(
     patches_out.albedo[i] = hemispherical_albedo(s)
     patches_out.reach[i] = s.reach
     patches_out.real[i] = 1 - s.synthetic
+    patches_out.place[i] = wp.int64(level_key_in[face_key_in[i] / 6]) * wp.int64(6) + wp.int64(face_key_in[i] % 6)
     table_out[face_key_in[i]] = i
 
 
@@ -184,6 +200,28 @@ def patch_at(
     return best
 
 
+@wp.func
+def find_patch(hits: PatchHits, patches: Patches, i: int) -> int:
+    """The same patch among those of an earlier frame, or -1: the same place, and the same surface in it."""
+    place = patches.place[i]
+    low = int(0)
+    high = int(hits.count)
+    while low < high:
+        middle = (low + high) / 2
+        if hits.place[middle] < place:
+            low = middle + 1
+        else:
+            high = middle
+    if low >= hits.count:
+        return -1
+    if hits.place[low] != place or hits.reach[low] != patches.reach[i]:
+        return -1
+    for axis in range(3):
+        if hits.position[low][axis] != patches.position[i][axis] or hits.normal[low][axis] != patches.normal[i][axis]:
+            return -1
+    return low
+
+
 @wp.kernel
 def _link_patches(
     first: int,
@@ -194,13 +232,20 @@ def _link_patches(
     level: int,
     level_first: int,
     table_in: wp.array(dtype=wp.int32),
+    last: PatchHits,
     rays: int,
     seed: int,
     link_out: wp.array(dtype=wp.vec2i),
     irradiance_out: wp.array(dtype=wp.vec3),
+    distance_out: wp.array(dtype=wp.float32),
+    triangle_out: wp.array(dtype=wp.int32),
 ):
     """Trace a patch's rays: where they end (before, after), and the first bounce's irradiance."""
     i = first + wp.tid()
+    known = find_patch(last, patches, i)
+    # Random numbers go by place, not by rank, which depends on what else there is.
+    index = int(patches.place[i] / wp.int64(6))
+    face = int(patches.place[i] % wp.int64(6))
     normal = patches.normal[i]
     s = Surface()
     s.position = patches.position[i]
@@ -210,9 +255,17 @@ def _link_patches(
     after = wp.vec3(0.0, 0.0, 0.0)
     width = wp.sqrt(PI / float(rays))
     for k in range(rays):
-        direction = from_frame(cosine_hemisphere(sobol2(seed, i, k, 23)), normal)
+        direction = from_frame(cosine_hemisphere(sobol2(seed, index, k, 23 + face)), normal)
         origin = spawn_point(s, direction)
-        real = trace_real(geo, origin, direction, FAR)
+        real = Hit()
+        if known >= 0:
+            real.t = last.distance[known * rays + k]
+            real.triangle = last.triangle[known * rays + k]
+            real.found = wp.where(real.triangle >= 0, 1, 0)
+        else:
+            real = trace_real(geo, origin, direction, FAR)
+        distance_out[i * rays + k] = real.t
+        triangle_out[i * rays + k] = real.triangle
         synthetic = trace_synthetic(geo, origin, direction, real.t)
         link = wp.vec2i(-1, -1)
         if real.found != 0:

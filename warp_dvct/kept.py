@@ -46,15 +46,15 @@ class Kept:
         self._entries[name] = (key, value)
         return value
 
-    def last(self, name: str) -> Any:
-        """What was kept under ``name`` last, or None."""
+    def last(self, name: str, key: Any) -> Any:
+        """What :meth:`put` kept for ``key``, or None: for results that find out element by element what still holds."""
         entry = self._entries.get(name)
-        return None if entry is None else entry[1]
+        self.reused[name] = entry is not None and entry[0] == key
+        return entry[1] if entry is not None and entry[0] == key else None
 
-    def put(self, name: str, value: Any) -> None:
-        """Keep ``value``, for results that find out element by element what of the last one still holds."""
-        self.reused[name] = name in self._entries
-        self._entries[name] = (None, value)
+    def put(self, name: str, key: Any, value: Any) -> None:
+        """Keep ``value`` instead of what was kept under ``name``."""
+        self._entries[name] = (key, value)
 
 
 def content_key(*values: Any) -> str:

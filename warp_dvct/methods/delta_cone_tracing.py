@@ -90,7 +90,7 @@ def light_volumes(
     bounces = bounce_field(launcher, None)
     if settings.bounces > 1:
         with launcher.scope("bounces"):
-            bounces = _bounce(launcher, device_scene, normals, world, volumes, fluxes, plan)
+            bounces = _bounce(launcher, device_scene, normals, world, volumes, fluxes, plan, kept)
     if needed["pyramid"]:
         with launcher.scope("pyramid"):
             for voxels in volumes:
@@ -272,6 +272,7 @@ def _bounce(
     volumes: list[Voxels],
     fluxes: list[Any],
     plan: Plan,
+    kept: Kept,
 ) -> Any:
     settings = plan.settings
     patches = choose_patches(launcher, scene, volumes[-1], normals, settings.patches_count)
@@ -283,6 +284,7 @@ def _bounce(
         bounces=settings.bounces - 1,
         rays=settings.patches_rays,
         seed=settings.seed,
+        kept=kept,
     )
     field = bounce_field(launcher, patches, total)
     for voxels, flux in zip(volumes, fluxes, strict=True):

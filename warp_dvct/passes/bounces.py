@@ -8,12 +8,15 @@ from typing import Any
 import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
+from warp_dvct.kept import Kept
 from warp_dvct.kernels import bounces as kernels
 from warp_dvct.kernels.bounce_field import BounceField
 from warp_dvct.kernels.volume import Volume
 from warp_dvct.kernels.voxelization import EMPTY_KEY
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.voxels import Voxels, count_below, sort_by_key, unique_runs
+
+PATCH_HITS = "patches' real hits"
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,7 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
     data.position, data.normal, data.albedo = (launcher.zeros(max(1, count), wp.vec3) for _ in range(3))
     data.reach = launcher.zeros(max(1, count), wp.float32)
     data.real = launcher.zeros(max(1, count), wp.int32)
+    data.place = launcher.zeros(max(1, count), wp.int64)
     table = launcher.full(max(1, 6 * voxels.level_records[level]), -1, wp.int32)
     pieces = voxels.fragments
     launcher.launch(
@@ -90,6 +94,7 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
             scene.materials,
             normals,
             keys,
+            voxels.level_keys[level],
             starts,
             order,
             count_below(launcher, key, 6 * records),
@@ -108,15 +113,27 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
 
 
 def solve_bounces(
-    launcher: Launcher, scene: DeviceScene, world: Any, patches: Patches, *, bounces: int, rays: int, seed: int = 0
+    launcher: Launcher,
+    scene: DeviceScene,
+    world: Any,
+    patches: Patches,
+    *,
+    bounces: int,
+    rays: int,
+    seed: int = 0,
+    kept: Kept | None = None,
 ) -> Any:
     """Irradiance of patches from bounces 1 … ``bounces``, before and after: vec3 ``[patches * 2]``.
 
     Args:
         world: ``kernels.gather.World`` whose volumes hold directly lit radiosity.
         rays: Cosine-distributed rays per patch; they are traced once.
+        kept: Holds what these rays met in the real scene from frame to frame, patch by patch.
     """
     count = patches.count
+    kept = kept or Kept()
+    key = (patches.voxels.box, patches.level, rays, seed)
+    hits = _patch_hits(launcher, patches, rays)
     links = launcher.empty(max(1, count * rays), wp.vec2i)
     last = launcher.zeros(max(1, 2 * count), wp.vec3)
     launcher.launch(
@@ -130,11 +147,13 @@ def solve_bounces(
             patches.level,
             patches.level_first,
             patches.table,
+            kept.last(PATCH_HITS, key) or kernels.PatchHits(),
             rays,
             seed,
         ],
-        [links, last],
+        [links, last, hits.distance, hits.triangle],
     )
+    kept.put(PATCH_HITS, key, hits)
     total = launcher.empty(max(1, 2 * count), wp.vec3)
     wp.copy(total, last)
     following = launcher.zeros(max(1, 2 * count), wp.vec3)
@@ -142,6 +161,16 @@ def solve_bounces(
         launcher.launch(kernels._bounce, count, [patches.data, links, rays, last], [following, total])
         last, following = following, last
     return total
+
+
+def _patch_hits(launcher: Launcher, patches: Patches, rays: int) -> Any:
+    """``PatchHits`` of patches, still to be filled."""
+    hits, data = kernels.PatchHits(), patches.data
+    hits.count = patches.count
+    hits.place, hits.position, hits.normal, hits.reach = data.place, data.position, data.normal, data.reach
+    hits.distance = launcher.empty(max(1, patches.count * rays), wp.float32)
+    hits.triangle = launcher.empty(max(1, patches.count * rays), wp.int32)
+    return hits
 
 
 def bounce_field(launcher: Launcher, patches: Patches | None, total: Any = None) -> Any:
