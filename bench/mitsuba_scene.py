@@ -15,7 +15,7 @@ from warp_dvct.scene import Camera, Light, LightKind, Material, Mesh, Role, Scen
 SUN_DISTANCE = 1.0e4  # metres at which a distant light of some angle is a disk
 WRAPS = {Wrap.REPEAT: "repeat", Wrap.CLAMP: "clamp", Wrap.MIRROR: "mirror"}
 LAMBERT = "diffuse"
-GLOSSY = "principled (Disney's diffuse lobe and Fresnel instead of Lambert below Schlick)"
+GLOSSY = "principled (its diffuse albedo lowered by what our mean Fresnel reflection takes, not angle by angle)"
 
 
 def describe_materials(scene: Scene) -> str:
@@ -96,25 +96,35 @@ def _is_lambert(material: Material) -> bool:
 
 
 def _bsdf(mi: Any, scene: Scene, material: Material) -> dict[str, Any]:
-    color: dict[str, Any] = {"type": "rgb", "value": [float(v) for v in material.base_color]}
-    if material.base_color_texture is not None:
-        color = _bitmap(mi, scene.textures[material.base_color_texture])
     if _is_lambert(material):
-        return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": color}}
+        return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": _color(mi, scene, material, 1.0)}}
     if material.roughness_texture is not None:
         raise OptionError(f"{material.name}: a roughness texture is not mapped to Mitsuba")
-    ior = material.ior
+    f0, metallic = ((material.ior - 1) / (material.ior + 1)) ** 2, float(material.metallic)
     if material.specular_color is not None:
-        root = math.sqrt(min(max(float(np.mean(material.specular_color)), 0.0), 0.9))
-        ior = (1 + root) / (1 - root)
-    lobes = {"roughness": float(material.roughness), "metallic": float(material.metallic), "eta": float(ior)}
+        f0, metallic = min(max(float(np.mean(material.specular_color)), 0.0), 0.9), 0.0
+    # Ours takes (1 - F) towards light and eye from the diffuse lobe; the cosine-weighted mean of Schlick's F is this.
+    mean_fresnel = f0 + (min(50 * f0, 1.0) - f0) / 21
+    color = _color(mi, scene, material, metallic + (1 - metallic) * (1 - mean_fresnel) ** 2)
+    lobes = {"roughness": float(material.roughness), "metallic": metallic, "eta": _eta(f0)}
     return {"type": "twosided", "bsdf": {"type": "principled", "base_color": color, **lobes}}
 
 
-def _bitmap(mi: Any, texture: Texture) -> dict[str, Any]:
+def _eta(f0: float) -> float:
+    """Index of refraction whose reflectance at normal incidence is ``f0``; Mitsuba takes none below 1."""
+    return (1 + math.sqrt(f0)) / (1 - math.sqrt(f0)) if f0 > 0 else 1.0 + 1e-3
+
+
+def _color(mi: Any, scene: Scene, material: Material, scale: float) -> dict[str, Any]:
+    if material.base_color_texture is not None:
+        return _bitmap(mi, scene.textures[material.base_color_texture], scale)
+    return {"type": "rgb", "value": [scale * float(v) for v in material.base_color]}
+
+
+def _bitmap(mi: Any, texture: Texture, scale: float) -> dict[str, Any]:
     if texture.wrap_s != texture.wrap_t or texture.wrap_s not in WRAPS:
         raise OptionError(f"{texture.name}: wrap modes that differ, or black, are not mapped to Mitsuba")
-    pixels = mi.Bitmap(np.ascontiguousarray(texture.pixels, np.float32))
+    pixels = mi.Bitmap(np.ascontiguousarray(texture.pixels * scale, np.float32))
     return {"type": "bitmap", "bitmap": pixels, "raw": True, "wrap_mode": WRAPS[texture.wrap_s]}
 
 

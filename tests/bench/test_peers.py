@@ -54,6 +54,18 @@ def test_mitsuba_renders_our_stage(stage, mi, cache, launcher, tmp_path):
     np.testing.assert_allclose(quarters[0][1:], quarters[1][1:], atol=0.05 * truth.before.mean())
 
 
+def test_a_coated_material_is_near(mi, cache, launcher, tmp_path, monkeypatch):
+    """The bunny's clay, a dielectric over a diffuse base: within 5 % of its mean radiance, by another BRDF."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    scene = read(path("bunny"))
+    store = ReferenceStore(scene, WIDTH, HEIGHT, samples=SPP, seed=1, cache=cache, launcher=launcher, quiet=True)
+    truth = store.get(1)
+    comp = MitsubaPair(mi, scene, truth, tmp_path, 1, False).composite(64)
+    whole = truth.coverage == 1
+    assert whole.sum() > 20
+    assert comp[whole].mean() == pytest.approx(truth.comp[whole].mean(), rel=0.05)
+
+
 def test_the_peers_are_measured_and_printed(cache, tmp_path, monkeypatch):
     """With Mitsuba and the denoiser; without the latter it is named and left out."""
     pytest.importorskip("mitsuba")
