@@ -121,7 +121,7 @@ def look(geo: Geometry, origin: wp.vec3, direction: wp.vec3, reach: float, need_
 def unlit(lights: Lights, k: int, s: Surface) -> bool:
     """Whether a light lies wholly behind a surface, or emits away from it: it then sends nothing, whatever is between."""
     if lights.kind[k] == DISTANT:
-        # cos(90 degrees + spread) = -sin(spread), and sin^2 = cap (2 - cap)
+        # The sine of the half angle follows from its cap: the square is cap times (2 - cap).
         cap = lights.cap[k]
         return -wp.dot(lights.direction[k], s.normal_g) < -wp.sqrt(wp.max(cap * (2.0 - cap), 0.0)) - UNLIT_MARGIN
     to_light = lights.position[k] - s.position
