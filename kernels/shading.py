@@ -119,7 +119,7 @@ def look(geo: Geometry, origin: wp.vec3, direction: wp.vec3, reach: float, need_
 
 @wp.func
 def unlit(lights: Lights, k: int, s: Surface) -> bool:
-    """Whether a light lies wholly behind a surface, or emits away from it: it then sends nothing, whatever is between."""
+    """Whether a light lies wholly behind a surface or emits away from it, and so sends nothing, whatever is between."""
     if lights.kind[k] == DISTANT:
         # The sine of the half angle follows from its cap: the square is cap times (2 - cap).
         cap = lights.cap[k]
