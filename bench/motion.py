@@ -54,6 +54,7 @@ class Flicker:
 
     Attributes:
         frames: Consecutive frames. size: Pixels. truth_samples: Per pixel of the truth.
+        truth_noise: LDR-FLIP that the truth's own noise is worth in a single frame; it is in all the figures.
         ours, peer: Of the method, and of the path tracer at 4 samples a pixel.
         peer_name: What the peer is, with or without a denoiser.
         ours_error, peer_error: Mean LDR-FLIP of the single frames.
@@ -62,6 +63,7 @@ class Flicker:
     frames: int
     size: tuple[int, int]
     truth_samples: int
+    truth_noise: float
     ours: float
     peer: float
     peer_name: str
@@ -236,6 +238,7 @@ def _flicker(scenes: Sequence[Scene], options: MotionOptions) -> Flicker:
         len(scenes),
         (width, height),
         options.samples,
+        _mean(t.noise for t in truths),
         flicker_of(ours, expected),
         flicker_of(peer, expected),
         name,
@@ -314,7 +317,8 @@ def format_report(report: MotionReport) -> str:
         f = report.flicker
         least = max(f.peer, 1e-9)
         lines.append(
-            f"flicker over {f.frames} frames at {f.size[0]}x{f.size[1]} (truth of {f.truth_samples} spp): ours"
+            f"flicker over {f.frames} frames at {f.size[0]}x{f.size[1]} (truth of {f.truth_samples} spp,"
+            f" its noise {f.truth_noise:.4f}): ours"
             f" {f.ours:.4f}, {f.peer_name} {f.peer:.4f}, ratio {f.ours / least:.2f};"
             f" FLIP of the single frames {f.ours_error:.4f} and {f.peer_error:.4f}"
         )
