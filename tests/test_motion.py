@@ -141,7 +141,9 @@ def test_the_box_goes_in_steps_and_holds_the_objects(scale):
     frames = set()
     for _ in range(200):
         moment = scene(rng.uniform(-0.05, 0.05, 3))
-        low, high = moment.bounds(Role.SYNTHETIC)
+        bounds = moment.bounds(Role.SYNTHETIC)
+        assert bounds is not None
+        low, high = bounds
         frame = volume_frame(moment, scale)
         assert (low >= frame.origin - 1e-12).all()
         assert (high <= frame.origin + frame.edge + 1e-12).all()
@@ -158,7 +160,9 @@ def test_objects_outside_of_the_real_scene_are_in_the_coarse_volume():
     ground = lit.mesh(lit.rectangle((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)))
     above = lit.scene_of(ground, lit.mesh(lit.cuboid((0.5, 0.1003, 0.5), 0.1), Role.SYNTHETIC))
     frame = volume_frame(above, 2.0)
-    low, high = above.bounds()
+    bounds = above.bounds()
+    assert bounds is not None
+    low, high = bounds
     assert (frame.origin + frame.low * frame.edge <= low + 1e-12).all()
     assert (frame.origin + frame.high * frame.edge >= high - 1e-12).all()
 
