@@ -112,6 +112,8 @@ def test_interrupted_runs_leave_nothing(room, out, number, code):
         [sys.executable, "-c", script, *arguments, "--set", "samples=4000"],
         stderr=subprocess.PIPE,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        # A shell that runs the tests in the background hands SIGINT down as ignored; a user's terminal does not.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     assert process.stderr is not None
     try:
