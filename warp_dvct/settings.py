@@ -37,7 +37,7 @@ class Settings:
     volume_coarse: int = _knob(128, "voxels an edge of the volume around the fine one; 0 for none", low=0, high=1024)
     volume_reach: float = _knob(16.0, "largest edge of the coarse volume, in edges of the fine one", low=1.0, high=1e4)
 
-    rsm_texels: int = _knob(512, "most texels an edge of a reflective shadow map", low=1, high=8192)
+    rsm_texels: int = _knob(1024, "most texels an edge of a reflective shadow map", low=1, high=8192)
     rsm_density: float = _knob(1.0, "texels per voxel edge at the volume's far side", low=0.01, high=16.0)
 
     shadows: str = _knob("ray", "how direct shadows are found", choices=("ray", "cone"))
@@ -113,7 +113,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "bounces": 4,
         "volume.resolution": 96,
         "volume.coarse": 64,
-        "rsm.texels": 192,
+        "rsm.texels": 320,
         "antialias": 3,
         "shadows.samples": 6,
         "shadows.probes": 6,
