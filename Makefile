@@ -47,11 +47,11 @@ test: $(VENV)/.test-installed
 
 # pyright sees links to the folders that only an installation maps into the package, and untyped stand-ins for what has
 # no types (the kernels, which are Warp's own language, and pxr) or may be absent (what the extras bring).
-STAND_INS := pxr/__init__.py flip_evaluator.py mitsuba.py drjit.py oidn.py open3d.py
+STAND_INS := pxr/__init__.py flip_evaluator.py mitsuba.py drjit.py oidn.py open3d.py cv2.py libusb_package.py matplotlib/__init__.py matplotlib/pyplot.py
 lint: $(VENV)/.dev-installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	@rm -rf $(VENV)/typing && mkdir -p $(VENV)/typing/warp_dvct/kernels $(VENV)/typing/pxr
+	@rm -rf $(VENV)/typing && mkdir -p $(VENV)/typing/warp_dvct/kernels $(VENV)/typing/pxr $(VENV)/typing/matplotlib
 	@ln -s ../../../bench ../../../usd_scenes $(VENV)/typing/warp_dvct/
 	@for f in $(STAND_INS) $$(ls kernels/*.py | sed 's,^,warp_dvct/,'); do \
 	  printf 'from typing import Any\n\ndef __getattr__(name: str) -> Any: ...\n' > $(VENV)/typing/$${f}i; done
