@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_dvct.check import Checker, poison
 from warp_dvct.errors import DeviceError, OptionError
 
 SLABS_PER_THREAD = 8  # enough that an uneven slab does not leave the other threads idle
@@ -31,29 +32,42 @@ class Launcher:
     Args:
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
         threads: CPU threads for slab launches; None for all cores that this process may use. Ignored on CUDA.
+        check: Whether to look at what every launch wrote (``warp_dvct.check``).
     Raises:
         DeviceError: The device is not present.
         OptionError: ``threads`` is below 1.
     """
 
-    def __init__(self, device: str = "cpu", threads: int | None = None) -> None:
+    def __init__(self, device: str = "cpu", threads: int | None = None, *, check: bool = False) -> None:
         self.device = find_device(device)
         if threads is not None and threads < 1:
             raise OptionError(f"threads is {threads}; give a number of at least 1")
         self.threads = 1 if self.device.is_cuda else (threads or len(os.sched_getaffinity(0)))
         self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
         self.pass_seconds: dict[str, float] = {}
+        self.pass_cpu_seconds: dict[str, float] = {}
         self.compile_seconds = 0.0
+        self.compile_cpu_seconds = 0.0
         self.live_bytes = 0
         self.peak_bytes = 0
         self._scopes: list[list[Any]] = []
         self._loaded: set[tuple[int, str]] = set()
+        self.checker = Checker() if check else None
 
     def launch(self, kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:
-        """Run ``kernel`` for elements 0 … count - 1; its first argument, the slab's start, is supplied here."""
+        """Run ``kernel`` for elements 0 … count - 1; its first argument, the slab's start, is supplied here.
+
+        Raises:
+            CheckError: ``check`` was asked for, and the kernel wrote a number that it should not.
+        """
         if count <= 0:
             return
         self.load(kernel.module)
+        self._launch_all(kernel, count, inputs, outputs)
+        if self.checker is not None:
+            self.checker.after(self._scope_name(), kernel, count, inputs, outputs, self.device)
+
+    def _launch_all(self, kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
         slab = count
         if self._pool is not None:
             slab = max(MIN_SLAB, -(-count // (self.threads * SLABS_PER_THREAD)))
@@ -79,6 +93,11 @@ class Launcher:
         if count > 0:
             self.load(kernel.module)
             self._launch_slab(kernel, 0, count, inputs, outputs)
+            if self.checker is not None:
+                self.checker.after(self._scope_name(), kernel, count, inputs, outputs, self.device)
+
+    def _scope_name(self) -> str:
+        return self._scopes[-1][0] if self._scopes else "loading the scene"
 
     def _launch_slabs(self, kernel, waiting: deque[int], slab: int, count: int, inputs, outputs) -> None:
         """Take slabs until none is left. A recorded launch costs a fifth of a new one, and both hold Python's lock."""
@@ -102,45 +121,54 @@ class Launcher:
         key = (id(module), self.device.alias)
         if key in self._loaded:
             return
-        start = time.perf_counter()
+        start, cpu_start = time.perf_counter(), time.process_time()
         level, wp.config.log_level = wp.config.log_level, wp.LOG_WARNING
         try:
             # Without it the CPU build is for blocks of 256, which no CPU launch uses: each thread would build again.
             module.load(self.device, block_dim=1 if self.device.is_cpu else None)
         finally:
             wp.config.log_level = level
-        spent = time.perf_counter() - start
+        spent, cpu_spent = time.perf_counter() - start, time.process_time() - cpu_start
         self.compile_seconds += spent
-        for scope in self._scopes:
-            scope[1] += spent
+        self.compile_cpu_seconds += cpu_spent
+        self._exclude(spent, cpu_spent)
         self._loaded.add(key)
 
     @contextmanager
     def scope(self, name: str) -> Iterator[None]:
         """Add the time spent inside to ``pass_seconds[name]``, without compilation; nested scopes count on their own.
 
-        Running out of memory inside raises DeviceError with the pass's name.
+        ``pass_cpu_seconds`` holds the processor time of all threads, which moves less on a busy machine. Running out
+        of memory inside raises DeviceError with the pass's name.
         """
-        scope = [name, 0.0]
+        scope = [name, 0.0, 0.0]
         self._scopes.append(scope)
-        start = time.perf_counter()
+        start, cpu_start = time.perf_counter(), time.process_time()
         try:
             yield
             wp.synchronize_device(self.device)
         finally:
             self._scopes.pop()
-            spent = time.perf_counter() - start - scope[1]
+            spent, cpu_spent = time.perf_counter() - start - scope[1], time.process_time() - cpu_start - scope[2]
             self.pass_seconds[name] = self.pass_seconds.get(name, 0.0) + spent
-            for outer in self._scopes:
-                outer[1] += spent
+            self.pass_cpu_seconds[name] = self.pass_cpu_seconds.get(name, 0.0) + cpu_spent
+            self._exclude(spent, cpu_spent)
+
+    def _exclude(self, seconds: float, cpu_seconds: float) -> None:
+        """Time that the scopes around do not count as their own."""
+        for scope in self._scopes:
+            scope[1] += seconds
+            scope[2] += cpu_seconds
 
     def reset_times(self) -> None:
         """Forget the seconds per pass (not the compile seconds), as before a new frame."""
         self.pass_seconds = {}
+        self.pass_cpu_seconds = {}
 
     def empty(self, shape: int | tuple[int, ...], dtype: Any) -> wp.array:
         """An uninitialised device array, counted in ``peak_bytes``."""
-        return self._counted(lambda: wp.empty(shape, dtype=dtype, device=self.device), shape, dtype)
+        array = self._counted(lambda: wp.empty(shape, dtype=dtype, device=self.device), shape, dtype)
+        return array if self.checker is None else poison(array)
 
     def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> wp.array:
         """A zeroed device array, counted in ``peak_bytes``."""
@@ -160,9 +188,8 @@ class Launcher:
             array = make()
         except (MemoryError, RuntimeError) as error:
             size = int(np.prod(shape)) * wp.types.type_size_in_bytes(dtype)
-            where = self._scopes[-1][0] if self._scopes else "loading the scene"
             raise DeviceError(
-                f"out of memory in pass '{where}': {size / 2**20:.0f} MiB more were asked for on {self.device.alias}"
+                f"out of memory in pass '{self._scope_name()}': {size / 2**20:.0f} MiB more were asked for on {self.device.alias}"
                 f" with {self.live_bytes / 2**20:.0f} MiB in use; lower --set volume.resolution or --imageWidth"
                 f" ({error})"
             ) from error

@@ -43,6 +43,8 @@ class Relighter:
         device: ``cpu``, ``cuda`` or ``cuda:N``. threads: CPU threads; None for all cores.
         real, synthetic: Prim paths whose role is set against what the stage says.
         strict: Treat anything in the stage that is not modelled as an error.
+        check: Look at what every kernel wrote; a number that is not finite or out of its range is a CheckError that
+            names pass, pixel and inputs. About twice as slow.
     Raises:
         StageError: The stage cannot be read. OptionError: An unknown or unsuitable argument.
         DeviceError: The device is absent or out of memory.
@@ -65,12 +67,13 @@ class Relighter:
         synthetic: Sequence[str] = (),
         strict: bool = False,
         purposes: Sequence[str] = ("default", "render"),
+        check: bool = False,
     ) -> None:
         if method not in METHODS:
             raise OptionError(f"method is '{method}'; choose one of {', '.join(METHODS)}")
         self.settings = make_settings(quality, settings)
         self.method = method
-        self._launcher = Launcher(device, threads)
+        self._launcher = Launcher(device, threads, check=check)
         self._stage = stage
         self._reading = {
             "camera": camera,
@@ -99,6 +102,8 @@ class Relighter:
             self.scene = read_stage(self._stage, time=time, **self._reading)
         self.load_seconds = clock.perf_counter() - start
         self.width, self.height = self._picture_size()
+        if self._launcher.checker is not None:
+            self._launcher.checker.width, self._launcher.checker.height = self.width, self.height
         self._plan(has_plate=self.scene.plate is not None or self._had_plate)
 
     def set_scene(self, scene: Scene) -> None:
@@ -132,8 +137,8 @@ class Relighter:
         report = progress or (lambda name, share: None)
         launcher = self._launcher
         launcher.reset_times()
-        compiled = launcher.compile_seconds
-        start = clock.perf_counter()
+        compiled, compiled_cpu = launcher.compile_seconds, launcher.compile_cpu_seconds
+        start, start_cpu = clock.perf_counter(), clock.process_time()
         self._had_plate = plate is not None
         if self._planned_plate != self._had_plate:
             self._plan(has_plate=self._had_plate)
@@ -146,13 +151,15 @@ class Relighter:
         report("composite", 0.95)
         with launcher.scope("composite"):
             layers = composite(launcher, radiance, plate)
-        spent = clock.perf_counter() - start
+        spent, spent_cpu = clock.perf_counter() - start, clock.process_time() - start_cpu
         report("done", 1.0)
         self.stats = {
             "load_seconds": self.load_seconds,
             "compile_seconds": launcher.compile_seconds,
             "render_seconds": spent - (launcher.compile_seconds - compiled),
+            "cpu_seconds": spent_cpu - (launcher.compile_cpu_seconds - compiled_cpu),
             "passes": dict(launcher.pass_seconds),
+            "cpu_passes": dict(launcher.pass_cpu_seconds),
             "peak_bytes": launcher.peak_bytes,
             "plan": self.plan.to_dict(),
             "kept": dict(self._kept.reused),

@@ -145,6 +145,7 @@ def test_statistics_have_the_documented_keys(command, moving_room, out):
         "load_seconds",
         "compile_seconds",
         "render_seconds",
+        "cpu_seconds",
         "passes",
         "peak_bytes",
         "plan",

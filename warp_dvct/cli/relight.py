@@ -227,6 +227,7 @@ class Run:
             "load_seconds": last["load_seconds"],
             "compile_seconds": last["compile_seconds"],
             "render_seconds": float(np.mean([record["render_seconds"] for record in self.records])),
+            "cpu_seconds": float(np.mean([record["cpu_seconds"] for record in self.records])),
             "passes": {n: float(np.mean([record["passes"].get(n, 0.0) for record in self.records])) for n in names},
             "peak_bytes": max(record["peak_bytes"] for record in self.records),
             "plan": relighter.plan.to_dict(),
