@@ -19,3 +19,7 @@ class FileError(DvctError):
 
 class DeviceError(DvctError):
     """A device that is absent, or that ran out of memory."""
+
+
+class CheckError(DvctError):
+    """A kernel wrote a number that is not finite or out of its range; only ``--check`` looks."""

@@ -189,9 +189,9 @@ class Launcher:
         except (MemoryError, RuntimeError) as error:
             size = int(np.prod(shape)) * wp.types.type_size_in_bytes(dtype)
             raise DeviceError(
-                f"out of memory in pass '{self._scope_name()}': {size / 2**20:.0f} MiB more were asked for on {self.device.alias}"
-                f" with {self.live_bytes / 2**20:.0f} MiB in use; lower --set volume.resolution or --imageWidth"
-                f" ({error})"
+                f"out of memory in pass '{self._scope_name()}': {size / 2**20:.0f} MiB more were asked for on"
+                f" {self.device.alias} with {self.live_bytes / 2**20:.0f} MiB in use; lower --set volume.resolution or"
+                f" --imageWidth ({error})"
             ) from error
         size = array.capacity
         self.live_bytes += size

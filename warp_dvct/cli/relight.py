@@ -57,6 +57,11 @@ class Stops(click.ParamType):
 @click.option("--skip-existing", is_flag=True, help="Leave out frames whose EXR is there: go on with a broken-off run.")
 @click.option("--stats", metavar="FILE", help="Write seconds, memory, plan and notices as JSON.")
 @click.option(
+    "--check",
+    is_flag=True,
+    help="Stop at the first NaN, infinity or value out of its range that a pass writes, and say where. Slower.",
+)
+@click.option(
     "--exposure",
     type=Stops(),
     default=0.0,
