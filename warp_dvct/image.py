@@ -46,7 +46,7 @@ def write_exr(
     if camera is not None:
         header["camera"] = camera.path
         header["worldToCamera"] = np.ascontiguousarray(np.linalg.inv(camera.to_world).T, np.float32)
-    with _replacing(Path(path)) as temporary:
+    with replacing(Path(path)) as temporary:
         try:
             with OpenEXR.File(header, exr_channels(layers)) as file:
                 file.write(str(temporary))
@@ -63,7 +63,7 @@ def write_radiance(path: str | Path, pixels: np.ndarray) -> None:
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with _replacing(Path(path)) as temporary:
+    with replacing(Path(path)) as temporary:
         try:
             with OpenEXR.File(header, {"RGB": np.ascontiguousarray(pixels, np.float32)}) as file:
                 file.write(str(temporary))
@@ -103,7 +103,7 @@ def write_png(path: str | Path, pixels: np.ndarray) -> None:
 
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, "uint8")
-    with _replacing(Path(path)) as temporary:
+    with replacing(Path(path)) as temporary:
         output = oiio.ImageOutput.create("png")
         assert output is not None  # every build of OpenImageIO has PNG
         done = output.open(str(temporary), spec) and output.write_image(np.ascontiguousarray(pixels, np.uint8))
@@ -119,7 +119,7 @@ def write_text(path: str | Path, text: str) -> None:
     Raises:
         FileError: The file cannot be written; nothing is left behind.
     """
-    with _replacing(Path(path)) as temporary:
+    with replacing(Path(path)) as temporary:
         try:
             temporary.write_text(text, encoding="utf-8")
         except OSError as error:
@@ -222,7 +222,7 @@ def _temporary(path: Path) -> Path:
 
 
 @contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path) -> Iterator[Path]:
     """A temporary name that becomes ``path`` at the end, and is removed if that is not reached."""
     temporary = _temporary(path)
     try:

@@ -1,0 +1,1 @@
+"""Captures from depth cameras: importers, the USD stage they become, simulation, live filtering, reconstruction."""
