@@ -263,10 +263,11 @@ def _content_keys(scene: Scene, plan: Plan) -> tuple[str, str]:
     but camera, plate and picture size."""
     surfaces = scene.materials, scene.textures
     meshes = [tuple(m for m in scene.meshes if m.role == role) for role in Role]
-    real = content_key(meshes[Role.REAL], *surfaces, plan.origin, plan.scale)
+    clouds = [tuple(c for c in scene.point_clouds if c.role == role) for role in Role]
+    real = content_key(meshes[Role.REAL], clouds[Role.REAL], *surfaces, plan.origin, plan.scale)
     passes = tuple(p.needed for p in plan.passes if p.name in ("voxelize", "pyramid", "bounces"))
     rest = (plan.settings, plan.fine, plan.coarse, plan.start, plan.maps, passes)
-    return real, content_key(real, meshes[Role.SYNTHETIC], scene.lights, *rest)
+    return real, content_key(real, meshes[Role.SYNTHETIC], clouds[Role.SYNTHETIC], scene.lights, *rest)
 
 
 def relight(stage: Any, *, plate: np.ndarray | None = None, **options: Any) -> Layers:

@@ -120,6 +120,31 @@ class Mesh:
 
 
 @dataclass(frozen=True)
+class PointCloud:
+    """Points of one prim, as a scan has them, in world space: each stands for a disc of surface.
+
+    Attributes:
+        points: float64, shape ``[n, 3]``, metres.
+        normals: Unit normals, float32 ``[n, 3]``; of arbitrary sign where they were estimated (then double-sided).
+        radii: Of the discs, metres, positive, float32 ``[n]``: half of UsdGeom's widths.
+        role: Real or synthetic.
+        material: Index into ``Scene.materials``; without textures, as points have no coordinates.
+        colors: Multiplied into the material's base colour, float32 ``[n, 3]``; None for white.
+        double_sided: Whether both sides of the discs are meant to be seen.
+        path: Prim path (of the instance), for messages and statistics.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    radii: np.ndarray
+    role: Role
+    material: int = 0
+    colors: np.ndarray | None = None
+    double_sided: bool = False
+    path: str = ""
+
+
+@dataclass(frozen=True)
 class Light:
     """An emitter; UsdLux semantics already resolved.
 
@@ -209,10 +234,12 @@ class Scene:
     camera: Camera
     plate: str | None = None
     notices: tuple[Notice, ...] = ()
+    point_clouds: tuple[PointCloud, ...] = ()
 
     def bounds(self, role: Role | None = None) -> tuple[np.ndarray, np.ndarray] | None:
-        """Axis-aligned bounds (low, high) in metres of the meshes of a role, or of all; None where there are none."""
+        """Axis-aligned bounds (low, high) in metres of the geometry of a role, or of all; None where there is none."""
         points = [m.points[m.triangles.ravel()] for m in self.meshes if role is None or m.role == role]
+        points += [c.points for c in self.point_clouds if role is None or c.role == role]
         points = [p for p in points if len(p)]
         if not points:
             return None

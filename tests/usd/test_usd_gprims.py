@@ -113,7 +113,7 @@ def test_sizes_that_are_not_positive_name_prim_and_attribute(build, kind, name, 
 
 def test_unsupported_surfaces_are_listed(build):
     define(build, "BasisCurves")
-    build.stage.DefinePrim("/World/Dots", "Points")
+    build.stage.DefinePrim("/World/Patch", "NurbsPatch")
     notices = [str(n) for n in build.read().notices]
     assert "/World/Shape: a BasisCurves is not supported and not drawn" in notices
-    assert "/World/Dots: a Points is not supported and not drawn" in notices
+    assert "/World/Patch: a NurbsPatch is not supported and not drawn" in notices

@@ -23,7 +23,7 @@ class Placed:
     """A prim and the places in which it is drawn.
 
     Attributes:
-        prim: Mesh, gprim or light; a proxy inside native instances.
+        prim: Mesh, points, gprim or light; a proxy inside native instances.
         matrices: ``[n, 4, 4]`` float64 for row vectors, from the prim's space to the world in metres.
         path: Shown to the user.
         role: Of geometry.
@@ -230,7 +230,7 @@ class Collector:
             self._walk(prim, below, self._inside_prototype, placed=True)
 
 
-DRAWN = ("Mesh", "Cube", "Sphere", "Cylinder", "Cylinder_1", "Cone", "Capsule", "Capsule_1", "Plane")
+DRAWN = ("Mesh", "Points", "Cube", "Sphere", "Cylinder", "Cylinder_1", "Cone", "Capsule", "Capsule_1", "Plane")
 
 
 def _is_surface(prim: Usd.Prim) -> bool:

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_dvct.errors import StageError
-from warp_dvct.scene import Light, Mesh, Notice, Scene
+from warp_dvct.scene import Light, Mesh, Notice, PointCloud, Scene
 from warp_dvct.usd.camera import choose_camera, read_camera, read_plate
 from warp_dvct.usd.collect import Collection, Collector, Placed
 from warp_dvct.usd.context import Context, shared_path
 from warp_dvct.usd.geometry import LocalMesh, WorldTriangles, place, read_local
 from warp_dvct.usd.lights import read_lights
 from warp_dvct.usd.materials import Look, Materials
+from warp_dvct.usd.points import LocalPoints, placed_radii, read_points
 from warp_dvct.usd.primvars import corner_values
 from warp_dvct.usd.roles import Roles, require_roles
 from warp_dvct.usd.stage import name_of, note_composition_errors, open_stage, quiet_diagnostics, world_frame
@@ -93,7 +94,7 @@ def _assemble(
     if not found.lights_defined:
         raise StageError(f"{name_of(ctx.stage)} has no light; add a UsdLux light")
     materials = Materials(ctx, images)
-    meshes = _MeshBuilder(ctx, materials).build(found.geometry)
+    meshes, clouds = _GeometryBuilder(ctx, materials).build(found.geometry)
     lights: list[Light] = []
     for placed in found.lights:
         lights += read_lights(placed, ctx, images)
@@ -107,6 +108,7 @@ def _assemble(
         camera=read_camera(eye, ctx),
         plate=read_plate(eye, ctx, plate),
         notices=ctx.notices.all(),
+        point_clouds=tuple(clouds),
     )
 
 
@@ -122,7 +124,7 @@ class _Parts:
     faces: np.ndarray | None  # [f] into looks; None where all have the first
 
 
-class _MeshBuilder:
+class _GeometryBuilder:
     """Puts geometry, materials and primvars together; what instances share is read once."""
 
     def __init__(self, ctx: Context, materials: Materials) -> None:
@@ -130,17 +132,28 @@ class _MeshBuilder:
         self._materials = materials
         self._local: dict[str, LocalMesh | None] = {}
 
-    def build(self, geometry: Sequence[Placed]) -> list[Mesh]:
-        """One mesh per prim or native instance; the copies of a point instancer's prototype share one."""
+    def build(self, geometry: Sequence[Placed]) -> tuple[list[Mesh], list[PointCloud]]:
+        """One mesh or cloud per prim or native instance; the copies of a point instancer's prototype share one."""
         locals_ = [self._read(placed) for placed in geometry]
         drawn = [(placed, local) for placed, local in zip(geometry, locals_, strict=True) if local is not None]
         parts = self._parts([placed for placed, _ in drawn], [local for _, local in drawn])
-        return [self._mesh(placed, local, part) for (placed, local), part in zip(drawn, parts, strict=True)]
+        meshes, clouds = [], []
+        for (placed, local), part in zip(drawn, parts, strict=True):
+            if isinstance(local, LocalPoints):
+                clouds.append(self._cloud(placed, local, part.looks[0]))
+            else:
+                meshes.append(self._mesh(placed, local, part))
+        return meshes, clouds
 
     def _read(self, placed: Placed) -> LocalMesh | None:
+        from pxr import UsdGeom
+
         key = shared_path(placed.prim)
         if key not in self._local:
-            self._local[key] = read_local(placed.prim, self._ctx)
+            points = placed.prim.IsA(UsdGeom.Points)
+            self._local[key] = (
+                read_points(UsdGeom.Points(placed.prim), self._ctx) if points else read_local(placed.prim, self._ctx)
+            )
         local = self._local[key]
         return local if local is not None and len(local.topology.triangles) else None
 
@@ -198,6 +211,28 @@ class _MeshBuilder:
             corner_normals=world.normals,
             corner_uvs=_copied(world, uvs),
             corner_colors=_copied(world, colors),
+            path=placed.path,
+        )
+
+    def _cloud(self, placed: Placed, local: LocalPoints, look: Look) -> PointCloud:
+        world = place(local, placed.matrices)
+        look, colors = self._resolve_color(placed, local, look)
+        material = look.material
+        if material.base_color_texture is not None or material.roughness_texture is not None:
+            self._ctx.notices.add(placed.path, "points have no texture coordinates; the mean of the texture is used")
+            material = replace(material, base_color_texture=None, roughness_texture=None)
+        self._ctx.notices.add(
+            placed.path, "its points cast the shadows of instant-radiosity's virtual lights; they are not drawn"
+        )
+        assert world.normals is not None
+        return PointCloud(
+            points=world.points[world.triangles[:, 0]],
+            normals=world.normals[:, 0],
+            radii=placed_radii(local, placed.matrices).astype(np.float32),
+            role=placed.role,
+            material=self._materials.index(material),
+            colors=None if colors is None else world.per_corner(colors)[:, 0],
+            double_sided=local.double_sided,
             path=placed.path,
         )
 
