@@ -1,9 +1,7 @@
-"""``python -m warp_dvct.bench error | curve | compare | peers | …``: see ``docs/benchmarks.md``."""
+"""``warp-dvct bench …``, also ``python -m warp_dvct.bench …``: see ``docs/benchmarks.md`` and ``docs/tradeoff.md``."""
 
 from __future__ import annotations
 
-import json
-import math
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -11,28 +9,16 @@ from typing import Any
 
 import click
 
+from warp_dvct.bench.options import settings_of, shared, write_json
+from warp_dvct.bench.trade_commands import TRADE_COMMANDS
 from warp_dvct.cli.quiet import start_warp
-from warp_dvct.errors import DvctError, OptionError
-from warp_dvct.image import write_text
+from warp_dvct.errors import DvctError
 from warp_dvct.usd_scenes import cache_folder
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 def bench() -> None:
     """Measure errors against the path-traced truth, and times beside the paper's."""
-
-
-def _shared(command: Any) -> Any:
-    for option in (
-        click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="A setting, as in warp-dvct relight."),
-        click.option("--device", default="cpu", show_default=True, help="cpu or cuda:N."),
-        click.option("--threads", type=int, help="CPU threads; all cores by default."),
-        click.option(
-            "--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file too."
-        ),
-    ):
-        command = option(command)
-    return command
 
 
 @bench.command()
@@ -48,7 +34,7 @@ def _shared(command: Any) -> Any:
 @click.option("--exposure", type=float, default=0.0, show_default=True, help="Stops, before FLIP and PNG.")
 @click.option("--cache", type=click.Path(path_type=Path), help="References; default: warp_dvct in the user's cache.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for PNGs: composite, truth, error map.")
-@_shared
+@shared
 def error(
     stages: tuple[str, ...], pairs: tuple[str, ...], json_file: Path | None, spp: int, cache: Path | None, **rest
 ):
@@ -70,7 +56,7 @@ def error(
 @click.option("--stage", "stages", multiple=True, help="A bundled stage or a USD file; repeatable. Default: room_area.")
 @click.option("--quality", default="balanced", show_default=True)
 @click.option("--width", type=int, default=96, show_default=True, help="Pixels across; one point per pixel.")
-@_shared
+@shared
 def eq9(stages: tuple[str, ...], pairs: tuple[str, ...], json_file: Path | None, **rest: Any) -> None:
     """The paper's eq. 9: error of the delta formulation, for our cones and for the paper's."""
     start_warp(rest["device"])
@@ -97,7 +83,7 @@ def eq9(stages: tuple[str, ...], pairs: tuple[str, ...], json_file: Path | None,
 @click.option("--width", type=int, default=1280, show_default=True)
 @click.option("--height", type=int, default=720, show_default=True)
 @click.option("--preset", is_flag=True, help="Our own preset's passes instead of the paper's cones and single bounce.")
-@_shared
+@shared
 def table1(quality: str, preset: bool, pairs: tuple[str, ...], json_file: Path | None, **rest: Any) -> None:
     """The paper's Table 1 (256^3 voxels, 720p, RSM of 1024^2) with this machine's times beside."""
     start_warp(rest["device"])
@@ -117,7 +103,7 @@ def table1(quality: str, preset: bool, pairs: tuple[str, ...], json_file: Path |
 @click.option("--runs", type=int, default=3, show_default=True, help="Warm runs; the median is printed.")
 @click.option("--bounces", type=int, multiple=True, default=(1, 3), show_default=True, help="Repeatable.")
 @click.option("--sight/--no-sight", default=True, show_default=True, help="Also compare shadow maps with rays.")
-@_shared
+@shared
 def instant_radiosity(stage: str, pairs: tuple[str, ...], json_file: Path | None, sight: bool, **rest: Any) -> None:
     """Times of instant radiosity at the paper's size and settings, and how well its shadow maps see."""
     start_warp(rest["device"])
@@ -146,7 +132,7 @@ def instant_radiosity(stage: str, pairs: tuple[str, ...], json_file: Path | None
 @click.option("--spp", type=int, default=64, show_default=True, help="Samples per pixel of the truth.")
 @click.option("--seed", type=int, default=1, show_default=True, help="Of the truth's random numbers.")
 @click.option("--cache", type=click.Path(path_type=Path), help="References; default: warp_dvct in the user's cache.")
-@_shared
+@shared
 def curve(stage: str, spp: int, pairs: tuple[str, ...], json_file: Path | None, cache: Path | None, **rest: Any):
     """Turn every knob up together: seconds, FLIP, error of the indirect delta, indirect energy."""
     from warp_dvct.bench import sweep as module
@@ -165,7 +151,7 @@ def curve(stage: str, spp: int, pairs: tuple[str, ...], json_file: Path | None, 
 @click.option("--spp", type=int, default=64, show_default=True, help="Samples per pixel of the truth.")
 @click.option("--seed", type=int, default=1, show_default=True, help="Of the truth's random numbers.")
 @click.option("--cache", type=click.Path(path_type=Path), help="References; default: warp_dvct in the user's cache.")
-@_shared
+@shared
 def compare(stage: str, texts: tuple[str, ...], spp: int, pairs: tuple[str, ...], json_file, cache, **rest: Any):
     """One stage under several settings, one line each: what a knob buys and what it costs."""
     from warp_dvct.bench import sweep as module
@@ -225,7 +211,7 @@ def _sweep(stage: str, trials: Any, spp: int, pairs: tuple[str, ...], json_file:
 @click.option("--flicker-width", type=int, default=320, show_default=True, help="Pixels, where flicker is measured.")
 @click.option("--spp", type=int, default=64, show_default=True, help="Samples per pixel of the flicker's truth.")
 @click.option("--cache", type=click.Path(path_type=Path), help="References; default: warp_dvct in the user's cache.")
-@_shared
+@shared
 def motion(stage: str, pairs: tuple[str, ...], json_file: Path | None, spp: int, cache: Path | None, **rest: Any):
     """A moving shot: frames a second, what is kept between frames, equality with frames from scratch, flicker."""
     start_warp(rest["device"])
@@ -239,38 +225,8 @@ def motion(stage: str, pairs: tuple[str, ...], json_file: Path | None, spp: int,
         write_json(json_file, {"options": asdict(options), "report": asdict(report)})
 
 
-def settings_of(pairs: tuple[str, ...]) -> dict[str, str]:
-    """``key=value`` strings as a dict.
-
-    Raises:
-        OptionError: One without ``=``.
-    """
-    settings = {}
-    for pair in pairs:
-        key, equals, value = pair.partition("=")
-        if not equals or not key:
-            raise OptionError(f"--set {pair!r} is not KEY=VALUE")
-        settings[key.strip()] = value.strip()
-    return settings
-
-
-def write_json(file: Path, content: dict[str, Any]) -> None:
-    """Write figures as JSON; NaN becomes null and a path its text.
-
-    Raises:
-        FileError: The file cannot be written.
-    """
-    write_text(file, json.dumps(_plain(content), indent=1, allow_nan=False) + "\n")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    if isinstance(value, Path):
-        return str(value)
-    return None if isinstance(value, float) and math.isnan(value) else value
+for _command in TRADE_COMMANDS:
+    bench.add_command(_command)
 
 
 def main() -> None:

@@ -62,7 +62,7 @@ def test_shell_command(command, workplace):
         check_make_target(command.split()[1])
     elif command.startswith(("pip install ", "python3 -m venv ")):
         check_installation(command)
-    elif command.startswith("python -m warp_dvct.bench "):
+    elif command.startswith(("python -m warp_dvct.bench ", "warp-dvct bench ")):
         check_bench(command, workplace)
     else:
         assert command.startswith("warp-dvct "), command
@@ -94,9 +94,10 @@ def check_installation(command: str) -> None:
 def check_bench(command: str, folder: Path) -> None:
     """The benchmark knows the options; to run it takes minutes."""
     words = command.split()
-    done = shell(" ".join([*words[:4], "--help"]), folder)
+    named = 4 if words[0] == "python" else 3
+    done = shell(" ".join([*words[:named], "--help"]), folder)
     assert done.returncode == 0, done.stderr
-    for option in words[4:]:
+    for option in words[named:]:
         assert not option.startswith("--") or option in done.stdout, f"{option} is unknown"
 
 

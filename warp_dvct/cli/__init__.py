@@ -12,6 +12,7 @@ from types import FrameType
 
 import click
 
+from warp_dvct.cli.bench import bench
 from warp_dvct.cli.plan import plan
 from warp_dvct.cli.probe import probe
 from warp_dvct.cli.relight import relight
@@ -30,7 +31,7 @@ def cli() -> None:
     """Insert synthetic objects into real scenes with physically convincing light."""
 
 
-for command in (relight, plan, probe, settings, scenes, warmup):
+for command in (bench, relight, plan, probe, settings, scenes, warmup):
     cli.add_command(command)
 
 
