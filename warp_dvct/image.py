@@ -94,7 +94,7 @@ def _to_half(values: np.ndarray) -> np.ndarray:
 
 
 def write_png(path: str | Path, pixels: np.ndarray) -> None:
-    """Write display-referred sRGB codes, uint8 ``[h, w, 3]``, as PNG.
+    """Write codes as they are, uint8 or uint16 ``[h, w, channels]``, as PNG: display-referred sRGB, or stored depth.
 
     Raises:
         FileError: The file cannot be written; nothing is left behind.
@@ -102,11 +102,12 @@ def write_png(path: str | Path, pixels: np.ndarray) -> None:
     import OpenImageIO as oiio
 
     height, width, channels = pixels.shape
-    spec = oiio.ImageSpec(width, height, channels, "uint8")
+    kind = np.uint16 if pixels.dtype == np.uint16 else np.uint8
+    spec = oiio.ImageSpec(width, height, channels, kind.__name__)
     with replacing(Path(path)) as temporary:
         output = oiio.ImageOutput.create("png")
         assert output is not None  # every build of OpenImageIO has PNG
-        done = output.open(str(temporary), spec) and output.write_image(np.ascontiguousarray(pixels, np.uint8))
+        done = output.open(str(temporary), spec) and output.write_image(np.ascontiguousarray(pixels, kind))
         message = "" if done else output.geterror()
         closed = output.close()
         if not (done and closed):
