@@ -161,7 +161,7 @@ def _write_depth(
     prim.CreateAttribute("dvct:depth:invalid", Sdf.ValueTypeNames.IntArray).Set(Vt.IntArray(list(rig.invalid)))
     lost = any(frame.pose is None for frame in frames)
     known = prim.CreateAttribute("dvct:pose:known", Sdf.ValueTypeNames.Bool) if lost else None
-    place = _Placement(camera)
+    place = Placement(camera)
     for frame, time in zip(frames, times, strict=True):
         file.Set(_asset(frame.depth, folder), time)
         if frame.pose is not None:
@@ -183,13 +183,13 @@ def _write_color(
 
     assert rig.color is not None
     camera = _define_camera(stage, f"{ROOT}/depth/color", rig.color)
-    _Placement(camera).set(FLIP @ np.linalg.inv(rig.depth_to_color) @ FLIP, None)
+    Placement(camera).set(FLIP @ np.linalg.inv(rig.depth_to_color) @ FLIP, None)
     file = camera.GetPrim().CreateAttribute("dvct:plate:file", Sdf.ValueTypeNames.Asset)
     for frame, time in zip(frames, times, strict=True):
         file.Set(_asset(frame.color, folder) if frame.color else Sdf.AssetPath(), time)
 
 
-class _Placement:
+class Placement:
     """Translate + orient of a camera: matrices would be interpolated number by number."""
 
     def __init__(self, camera: Any) -> None:
