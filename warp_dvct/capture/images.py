@@ -25,6 +25,19 @@ def image_size(file: str, what: str) -> tuple[int, int]:
         source.close()
 
 
+def is_depth_image(file: str) -> bool:
+    """Whether a file is an image of one channel with more than 8 bits."""
+    import OpenImageIO as oiio
+
+    try:
+        source = _open(file, "image")
+    except FileError:
+        return False
+    spec = source.spec()
+    source.close()
+    return spec.nchannels == 1 and spec.format.basetype != oiio.UINT8
+
+
 def read_depth(
     file: str, unit: float, invalid: Sequence[int] = (0,), size: tuple[int, int] | None = None, what: str = "depth"
 ) -> np.ndarray:

@@ -13,8 +13,10 @@ from types import FrameType
 import click
 
 from warp_dvct.cli.bench import bench
+from warp_dvct.cli.capture import capture
 from warp_dvct.cli.plan import plan
 from warp_dvct.cli.probe import probe
+from warp_dvct.cli.reconstruct import reconstruct
 from warp_dvct.cli.relight import relight
 from warp_dvct.cli.scenes import scenes
 from warp_dvct.cli.settings import settings
@@ -31,7 +33,7 @@ def cli() -> None:
     """Insert synthetic objects into real scenes with physically convincing light."""
 
 
-for command in (bench, relight, plan, probe, settings, scenes, warmup):
+for command in (bench, relight, plan, probe, reconstruct, settings, scenes, warmup, capture):
     cli.add_command(command)
 
 
