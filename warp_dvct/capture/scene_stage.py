@@ -1,0 +1,226 @@
+"""The reconstructed scene as a USD stage: the capture below it, the fused mesh as a crate payload, its lights."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warp_dvct.capture.fusion import FusedMesh
+from warp_dvct.capture.intrinsics import FLIP
+from warp_dvct.capture.stage import Capture, Placement
+from warp_dvct.errors import FileError, OptionError, StageError
+from warp_dvct.image import replacing, write_text
+from warp_dvct.usd.stage import open_stage, quiet_diagnostics, world_frame
+
+if TYPE_CHECKING:
+    from pxr import Usd
+
+GREY = (0.18, 0.18, 0.18)  # of a mesh that no frame has colour for; UsdPreviewSurface's own fallback
+
+
+@dataclass(frozen=True)
+class SceneLights:
+    """Lights of the real scene in the world (metres, y up).
+
+    Attributes:
+        layer: Text of a USD layer with default prim; None where ``file`` is given.
+        file: An existing layer or stage, which is referenced.
+        doc: What they are, for readers of the stage.
+    """
+
+    layer: str | None = None
+    file: str | None = None
+    doc: str = ""
+    data: dict[str, float | str | Sequence[float]] = field(default_factory=dict)
+
+
+def mesh_file(target: Path) -> Path:
+    """The payload beside a scene."""
+    return target.with_name(f"{target.stem}_mesh.usdc")
+
+
+def lights_file(target: Path) -> Path:
+    """The layer of estimated lights beside a scene."""
+    return target.with_name(f"{target.stem}_lights.usda")
+
+
+def write_scene(
+    path: str | Path,
+    capture: Capture,
+    mesh: FusedMesh,
+    *,
+    lights: SceneLights | None = None,
+    poses: Sequence[np.ndarray | None] | None = None,
+    facts: dict[str, Any] | None = None,
+) -> None:
+    """Write the scene and its payload; the capture's stage stays as it is and is a sublayer.
+
+    Each file is written under a temporary name and renamed, the scene last: an interruption leaves what was there.
+
+    Args:
+        path: ``.usda`` or ``.usdc``, another file than the capture.
+        mesh: In the capture stage's world.
+        lights: The real scene's lights; None for those that the capture has.
+        poses: Depth camera (OpenCV axes) to the stage's world of every frame, where tracking found others than the
+            capture's; None for a lost frame.
+        facts: Kept as ``customData`` of the mesh, as what it was made with.
+    Raises:
+        OptionError: The scene would overwrite its capture. FileError: A file cannot be written.
+    """
+    target = Path(os.path.abspath(path))
+    if target == Path(os.path.abspath(capture.path)):
+        raise OptionError(f"the scene '{path}' would overwrite the capture that it is made of; give another name")
+    root = Path(str(capture.depth_path)).parent.as_posix()
+    if root == "/":
+        raise StageError(f"{capture.depth_path} of '{capture.path}' has no prim above it; put it below an Xform")
+    with quiet_diagnostics():
+        _write_mesh(mesh_file(target), mesh, np.linalg.inv(capture.world))
+        if lights is not None and lights.layer is not None:
+            write_text(lights_file(target), lights.layer)
+        with replacing(target) as temporary:
+            stage = _new_scene(temporary, target, capture, root)
+            _author_mesh(stage, root, mesh_file(target).name, mesh, facts or {})
+            if poses is not None:
+                _author_poses(stage, capture, poses)
+            if lights is not None:
+                _author_lights(stage, root, target, lights, np.linalg.inv(capture.world))
+            _save(stage.GetRootLayer(), target)
+            del stage
+
+
+def _new_scene(temporary: Path, target: Path, capture: Capture, root: str) -> Usd.Stage:
+    """A stage over the capture, with its frame range, axes and units."""
+    from pxr import Sdf, Usd, UsdGeom
+
+    below = open_stage(capture.path)
+    stage = Usd.Stage.CreateNew(str(temporary))
+    stage.GetRootLayer().subLayerPaths.append(_relative(capture.path, target.parent))
+    default = below.GetDefaultPrim()
+    stage.GetRootLayer().defaultPrim = (default.GetPath() if default else Sdf.Path(root).GetPrefixes()[0]).name
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.GetStageUpAxis(below))
+    UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.GetStageMetersPerUnit(below))
+    stage.SetFramesPerSecond(below.GetFramesPerSecond())
+    stage.SetTimeCodesPerSecond(below.GetTimeCodesPerSecond())
+    stage.SetStartTimeCode(capture.times[0])
+    stage.SetEndTimeCode(capture.times[-1])
+    return stage
+
+
+def _relative(file: str, folder: Path) -> str:
+    relative = os.path.relpath(os.path.abspath(file), folder)
+    return relative if relative.startswith("..") else f"./{relative}"
+
+
+def _write_mesh(file: Path, mesh: FusedMesh, to_local: np.ndarray) -> None:
+    """The payload: one Mesh in the space of the prim above it."""
+    from pxr import Usd, UsdGeom, Vt
+
+    turn = to_local[:3, :3]
+    points = np.ascontiguousarray(mesh.points @ turn.T + to_local[:3, 3], np.float32)
+    normals = mesh.normals @ turn.T
+    normals = np.ascontiguousarray(normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12))
+    with replacing(file) as temporary:
+        stage = Usd.Stage.CreateNew(str(temporary))
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        prim = UsdGeom.Mesh.Define(stage, "/mesh")
+        stage.SetDefaultPrim(prim.GetPrim())
+        prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+        prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.triangles), 3, np.int32)))
+        prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(mesh.triangles.ravel(), np.int32)))
+        prim.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
+        prim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        prim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(0), points.max(0)])))
+        if mesh.colors is None:
+            prim.CreateDisplayColorAttr([GREY])
+        else:
+            colors = np.ascontiguousarray(np.clip(mesh.colors, 0.0, 1.0), np.float32)
+            prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(colors))
+        _save(stage.GetRootLayer(), file)
+        del stage
+
+
+def _author_mesh(stage: Usd.Stage, root: str, payload: str, mesh: FusedMesh, facts: dict[str, Any]) -> None:
+    """The mesh prim, tagged real, with a Lambert material of its displayColor."""
+    from pxr import Sdf, UsdGeom, UsdShade
+
+    _ignore_points(stage, root)
+    prim = UsdGeom.Mesh.Define(stage, f"{root}/mesh").GetPrim()
+    prim.GetPayloads().AddPayload(f"./{payload}")
+    tag = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("dvct:reality", Sdf.ValueTypeNames.Token)
+    tag.Set("real")
+    prim.SetCustomDataByKey("dvct:reconstruction", {"frames": mesh.frames, "skipped": len(mesh.skipped), **facts})
+    UsdGeom.Scope.Define(stage, f"{root}/Materials")
+    material = UsdShade.Material.Define(stage, f"{root}/Materials/Fused")
+    reader = UsdShade.Shader.Define(stage, f"{root}/Materials/Fused/Color")
+    reader.CreateIdAttr("UsdPrimvarReader_float3")
+    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
+    surface = UsdShade.Shader.Define(stage, f"{root}/Materials/Fused/Surface")
+    surface.CreateIdAttr("UsdPreviewSurface")
+    color = reader.CreateOutput("result", Sdf.ValueTypeNames.Float3)
+    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(color)
+    # The specular workflow with F0 = 0 is Lambert: a capture does not say how glossy things are.
+    surface.CreateInput("useSpecularWorkflow", Sdf.ValueTypeNames.Int).Set(1)
+    surface.CreateInput("specularColor", Sdf.ValueTypeNames.Color3f).Set((0.0, 0.0, 0.0))
+    surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+    UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
+
+
+def _ignore_points(stage: Usd.Stage, root: str) -> None:
+    """The mesh takes the place of clouds that the capture has: both would be there twice."""
+    from pxr import Sdf, UsdGeom
+
+    for prim in stage.GetPrimAtPath(root).GetAllChildren():
+        if prim.IsA(UsdGeom.Points):
+            tag = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("dvct:reality", Sdf.ValueTypeNames.Token)
+            tag.Set("ignore")
+
+
+def _author_poses(stage: Usd.Stage, capture: Capture, poses: Sequence[np.ndarray | None]) -> None:
+    """Replace the depth camera's poses in this stage alone; a lost frame keeps its images and is marked."""
+    from pxr import Sdf, UsdGeom
+
+    camera = UsdGeom.Camera(stage.OverridePrim(capture.depth_path))
+    camera.ClearXformOpOrder()
+    place = Placement(camera)
+    known = camera.GetPrim().CreateAttribute("dvct:pose:known", Sdf.ValueTypeNames.Bool)
+    to_local = np.linalg.inv(capture.world)
+    for pose, time in zip(poses, capture.times, strict=True):
+        known.Set(pose is not None, time)
+        if pose is not None:
+            place.set(to_local @ pose @ FLIP, time)
+
+
+def _author_lights(stage: Usd.Stage, root: str, target: Path, lights: SceneLights, to_local: np.ndarray) -> None:
+    """Reference the lights, turned from their own axes and units into those of the prim above them."""
+    from pxr import Gf, UsdGeom
+
+    file = lights_file(target) if lights.file is None else Path(os.path.abspath(lights.file))
+    source = open_stage(file)
+    if not source.GetDefaultPrim():
+        raise StageError(f"'{file}' has no default prim, so it cannot be referenced as lights; author defaultPrim")
+    _, to_world = world_frame(source)
+    group = UsdGeom.Xform.Define(stage, f"{root}/Lights")
+    group.AddTransformOp().Set(Gf.Matrix4d((to_world @ to_local.T).tolist()))
+    if lights.doc:
+        group.GetPrim().SetDocumentation(lights.doc)
+    for key, value in lights.data.items():
+        group.GetPrim().SetCustomDataByKey(f"dvct:{key}", value)
+    inner = stage.DefinePrim(f"{root}/Lights/Real")
+    inner.GetReferences().AddReference(_relative(str(file), target.parent))
+
+
+def _save(layer: Any, target: Path) -> None:
+    from pxr import Tf
+
+    try:
+        layer.Save()
+    except Tf.ErrorException as error:
+        raise FileError(f"{target} cannot be written: {error}; is the disk full?") from error
