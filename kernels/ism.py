@@ -17,7 +17,14 @@ from warp_dvct.kernels.geometry import (
     trace_real,
     trace_synthetic,
 )
-from warp_dvct.kernels.materials import Materials, hemispherical_albedo, surface_at
+from warp_dvct.kernels.materials import (
+    ALPHA_FLOOR,
+    GRAZING_GAIN,
+    Materials,
+    Surface,
+    hemispherical_albedo,
+    surface_at,
+)
 from warp_dvct.kernels.sampling import sobol2, tangent_of
 from warp_dvct.kernels.vpls import SKY, Vpls
 
@@ -51,11 +58,22 @@ class Cloud:
 
 
 @wp.struct
+class Dots:
+    """Points that a scan gives, structure of arrays."""
+
+    position: wp.array(dtype=wp.vec3)
+    normal: wp.array(dtype=wp.vec3)
+    radius: wp.array(dtype=wp.float32)
+    material: wp.array(dtype=wp.int32)
+    color: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
 class Pieces:
-    """Parts of triangles that points are drawn from: corners as weights of the triangle's first two corners."""
+    """What points are drawn from: parts of triangles, as weights of the triangle's first two corners, and dots."""
 
     count: wp.int32
-    triangle: wp.array(dtype=wp.int32)
+    triangle: wp.array(dtype=wp.int32)  # or -1 - the index of a dot
     a: wp.array(dtype=wp.vec2)
     b: wp.array(dtype=wp.vec2)
     c: wp.array(dtype=wp.vec2)
@@ -125,11 +143,34 @@ def place_in_map(vpls: Vpls, k: int, ism: Ism, position: wp.vec3) -> Place:
     return out
 
 
+@wp.func
+def dot_albedo(mats: Materials, material: int, color: wp.vec3) -> wp.vec3:
+    """Reflectance of a point, which has no texture coordinates."""
+    s = Surface()
+    base = wp.cw_mul(mats.base_color[material], color)
+    s.diffuse = base * (1.0 - mats.metallic[material])
+    s.f0 = wp.lerp(mats.f0[material], base, mats.metallic[material])
+    s.f90 = wp.min(GRAZING_GAIN * wp.max(s.f0[0], wp.max(s.f0[1], s.f0[2])), 1.0)
+    s.alpha = wp.max(mats.roughness[material] * mats.roughness[material], ALPHA_FLOOR)
+    return hemispherical_albedo(s)
+
+
 @wp.kernel
 def _sample_surface(
-    first: int, pieces: Pieces, geo: Geometry, mats: Materials, synthetic: int, block: int, seed: int, cloud_out: Cloud
+    first: int,
+    pieces: Pieces,
+    dots: Dots,
+    geo: Geometry,
+    mats: Materials,
+    synthetic: int,
+    block: int,
+    seed: int,
+    cloud_out: Cloud,
 ):
-    """Point i of a scrambled sequence over all pieces: each aligned block of 2^k points is stratified by itself."""
+    """Point i of a scrambled sequence over all pieces: each aligned block of 2^k points is stratified by itself.
+
+    Dots are taken as they are, and only grow where a block has room for fewer than there are.
+    """
     i = first + wp.tid()
     u = sobol2(seed, synthetic, i, 41)
     x = wp.float64(u[0])
@@ -142,6 +183,18 @@ def _sample_surface(
         else:
             high = middle
     chance = pieces.cdf[low + 1] - pieces.cdf[low]
+    share = pieces.area[low] / float(chance)
+    radius = wp.sqrt(share / (3.14159265 * float(block)))
+    cloud_out.area[i] = share / float(cloud_out.count)
+    cloud_out.radius[i] = radius
+    cloud_out.synthetic[i] = synthetic
+    if pieces.triangle[low] < 0:
+        dot = -1 - pieces.triangle[low]
+        cloud_out.position[i] = dots.position[dot]
+        cloud_out.normal[i] = dots.normal[dot]
+        cloud_out.radius[i] = wp.max(radius, dots.radius[dot])
+        cloud_out.albedo[i] = dot_albedo(mats, dots.material[dot], dots.color[dot])
+        return
     # The square root makes it uniform over the triangle; the number that chose the piece serves again inside of it.
     r = wp.sqrt(float((x - pieces.cdf[low]) / chance))
     weights = pieces.a[low] * (1.0 - r) + pieces.b[low] * (r * (1.0 - u[1])) + pieces.c[low] * (r * u[1])
@@ -156,13 +209,9 @@ def _sample_surface(
         wp.cross(corner_position(geo, hit.triangle, 1) - p, corner_position(geo, hit.triangle, 2) - p)
     )
     s = surface_at(geo, mats, hit, p, -normal)
-    share = pieces.area[low] / float(chance)
     cloud_out.position[i] = s.position
     cloud_out.normal[i] = s.normal_g
-    cloud_out.radius[i] = wp.sqrt(share / (3.14159265 * float(block)))
-    cloud_out.area[i] = share / float(cloud_out.count)
     cloud_out.albedo[i] = hemispherical_albedo(s)
-    cloud_out.synthetic[i] = synthetic
 
 
 @wp.func

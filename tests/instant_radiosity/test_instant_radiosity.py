@@ -15,12 +15,12 @@ from warp_dvct.methods.instant_radiosity import first_vpls, lit_region, make_vpl
 from warp_dvct.methods.path_tracing import gather_irradiance_reference
 from warp_dvct.passes.gbuffer import render_gbuffer
 from warp_dvct.passes.ism import draw_isms, new_isms, ray_sight
-from warp_dvct.passes.point_cloud import SurfacePoints, cloud_from_points, sample_surfaces
+from warp_dvct.passes.point_cloud import sample_surfaces
 from warp_dvct.passes.vpl_shading import VplLight, compare_sight, light_picture
 from warp_dvct.passes.vpls import LUMINANCE, light_maps, share_out
 from warp_dvct.plan import make_plan
 from warp_dvct.relighter import Relighter
-from warp_dvct.scene import Camera, Light, LightKind, LightRole, Material, Mesh, Role, Scene
+from warp_dvct.scene import Camera, Light, LightKind, LightRole, Material, Mesh, PointCloud, Role, Scene
 from warp_dvct.settings import make_settings
 from warp_dvct.usd.read import read_stage
 
@@ -329,22 +329,31 @@ def test_share_out():
     assert sum(share_out([0.3, 0.3, 0.4], 256)) == 256
 
 
-def test_seen_by_a_few_points_of_a_scan(launcher):
-    """A cloud given as points casts the shadow of the surface that it was taken from."""
+def scan_of(cloud, setup, role):
+    """Points on the surfaces of one role, as a scanner would give them: shuffled."""
+    order = np.random.default_rng(3).permutation(cloud.count)
+    points = cloud.position.numpy().astype(float) / setup.plan.scale + np.asarray(setup.plan.origin)
+    radii = np.sqrt(cloud.area.numpy() / np.pi) / setup.plan.scale
+    return PointCloud(points[order], cloud.normal.numpy()[order], radii[order].astype(np.float32), role, path="/Scan")
+
+
+def test_points_of_a_scan_cast_the_shadow_of_the_surface_they_were_taken_from(launcher):
+    """Maps drawn from given points alone see as those drawn from the surfaces do."""
     setup = bundled(launcher, "room_area", width=24)
     lights = setup.lights(visibility="ray", vpls_count=64)
-    drawn = sample_surfaces(launcher, setup.device_scene, setup.region, block=1024, blocks=4, seed=0)
-    given = []
-    for role, cloud in ((Role.REAL, drawn.real), (Role.SYNTHETIC, drawn.synthetic)):
-        radii = np.sqrt(cloud.area.numpy() / np.pi)
-        given.append(
-            cloud_from_points(launcher, cloud.position.numpy(), cloud.normal.numpy(), radii, role=role, block=1024)
-        )
+    drawn = sample_surfaces(launcher, setup.device_scene, setup.region, block=1024, blocks=32, seed=5)
+    scans = [scan_of(drawn.real, setup, Role.REAL), scan_of(drawn.synthetic, setup, Role.SYNTHETIC)]
+    bare = replace(setup.device_scene, triangles_vs=setup.device_scene.triangles_vs[:0])
+    bare.geometry.synthetic_first, kept = 0, bare.geometry.synthetic_first
+    cloud = sample_surfaces(launcher, bare, setup.region, block=1024, blocks=16, seed=0, scans=scans)
+    bare.geometry.synthetic_first = kept
+    given = set(map(tuple, drawn.real.position.numpy().round(4)))
+    assert set(map(tuple, cloud.real.position.numpy().round(4))) <= given
+    for ours, theirs in ((cloud.real, drawn.real), (cloud.synthetic, drawn.synthetic)):
+        assert ours.area.numpy().sum() == pytest.approx(theirs.area.numpy().sum(), rel=0.03)
     maps = new_isms(launcher, lights.vpls.count, size=128, bias=0.08, region=setup.region)
-    draw_isms(launcher, maps, lights.vpls, SurfacePoints(*given), 0, lights.vpls.count, grow=1.3)
+    draw_isms(launcher, maps, lights.vpls, cloud, 0, lights.vpls.count, grow=1.3)
     result = compare_sight(
         launcher, setup.device_scene, setup.buffer.points, setup.buffer.count, lights.vpls, maps, ray_sight(launcher)
     )
     assert result.agree > 0.95
-    with pytest.raises(ValueError, match="a block is 9"):
-        cloud_from_points(launcher, np.zeros((8, 3)), np.zeros((8, 3)), np.ones(8), role=Role.REAL, block=9)

@@ -121,6 +121,7 @@ class _Builder:
                     block=settings.ism_points,
                     blocks=settings.ism_blocks,
                     seed=settings.seed,
+                    scans=self.scene.point_clouds,
                 )
         return self._points
 

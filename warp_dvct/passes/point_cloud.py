@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,10 +11,10 @@ import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import ism as kernels
-from warp_dvct.kernels.ism import Cloud, Pieces
+from warp_dvct.kernels.ism import Cloud, Dots, Pieces
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.vpls import Region
-from warp_dvct.scene import Role
+from warp_dvct.scene import PointCloud, Role
 
 PIECE_SIZE = 0.35  # largest edge of a piece, in distances from the focus: what is far off is drawn from more coarsely
 MOST_PIECES = 200_000
@@ -28,7 +29,14 @@ class SurfacePoints:
 
 
 def sample_surfaces(
-    launcher: Launcher, scene: DeviceScene, region: Region, *, block: int, blocks: int, seed: int
+    launcher: Launcher,
+    scene: DeviceScene,
+    region: Region,
+    *,
+    block: int,
+    blocks: int,
+    seed: int,
+    scans: Sequence[PointCloud] = (),
 ) -> SurfacePoints:
     """Draw ``block * blocks`` points on real and as many on synthetic surfaces.
 
@@ -37,54 +45,34 @@ def sample_surfaces(
 
     Args:
         block: Points that one VPL uses; powers of two are stratified best.
+        scans: Points that are given; they are drawn by the area of their discs and taken as they are.
     """
     synthetic_first = scene.synthetic_first
     ranges = ((Role.REAL, 0, synthetic_first), (Role.SYNTHETIC, synthetic_first, len(scene.triangles_vs)))
     clouds = []
     for role, low, high in ranges:
         triangles = np.asarray(scene.triangles_vs[low:high], np.float64)
-        pieces = _pieces(triangles, low, region, thin=role == Role.REAL)
+        dots = _HostDots.gather([c for c in scans if c.role == role], scene, region)
+        pieces = _pieces(triangles, low, dots, region, thin=role == Role.REAL)
         count = block * blocks if pieces is not None else 0
         cloud = _new_cloud(launcher, count, block)
         if pieces is not None:
             launcher.launch(
                 kernels._sample_surface,
                 count,
-                [_upload(launcher, pieces), scene.geometry, scene.materials, int(role), block, seed],
+                [
+                    _upload(launcher, pieces),
+                    dots.upload(launcher),
+                    scene.geometry,
+                    scene.materials,
+                    int(role),
+                    block,
+                    seed,
+                ],
                 [cloud],
             )
         clouds.append(cloud)
     return SurfacePoints(*clouds)
-
-
-def cloud_from_points(
-    launcher: Launcher, positions: np.ndarray, normals: np.ndarray, radii: np.ndarray, *, role: Role, block: int
-) -> Any:
-    """A cloud from given points, as a scan or a ``UsdGeom.Points`` has them.
-
-    Args:
-        positions, normals: ``[n, 3]``, volume space; unit normals.
-        radii: ``[n]``, the radius that a point stands for among all ``n`` (half of ``UsdGeom.Points.widths``).
-        block: Points that one VPL uses; at most ``n``.
-    Raises:
-        ValueError: The arrays differ in length, or ``block`` is not in 1 … n.
-    """
-    count = len(positions)
-    if len(normals) != count or len(radii) != count or not 1 <= block <= count:
-        raise ValueError(f"{count} positions, {len(normals)} normals, {len(radii)} radii; a block is {block} of them")
-    # A block takes every so-many-th point, so that neighbours in the file do not all go to one VPL.
-    blocks = count // block
-    order = np.arange(blocks * block).reshape(block, blocks).T.ravel()
-    cloud = Cloud()
-    cloud.count, cloud.block = blocks * block, block
-    cloud.position = launcher.array(np.asarray(positions, np.float32)[order], wp.vec3)
-    cloud.normal = launcher.array(np.asarray(normals, np.float32)[order], wp.vec3)
-    radius = np.asarray(radii, np.float32)[order]
-    cloud.radius = launcher.array(radius * np.sqrt(np.float32(count / block)), wp.float32)
-    cloud.area = launcher.array((np.pi * radius**2).astype(np.float32), wp.float32)
-    cloud.albedo = launcher.zeros(len(order), wp.vec3)
-    cloud.synthetic = launcher.full(len(order), int(role), wp.int32)
-    return cloud
 
 
 def _new_cloud(launcher: Launcher, count: int, block: int) -> Any:
@@ -98,14 +86,65 @@ def _new_cloud(launcher: Launcher, count: int, block: int) -> Any:
 
 @dataclass(frozen=True)
 class _HostPieces:
-    triangle: np.ndarray
+    triangle: np.ndarray  # or -1 - the index of a dot
     corners: np.ndarray  # [n, 3, 2], weights of the triangle's first two corners
     area: np.ndarray
     weight: np.ndarray
 
 
-def _pieces(triangles: np.ndarray, first: int, region: Region, *, thin: bool) -> _HostPieces | None:
-    """Triangles cut until they are small for their distance from the focus; those outside of the region left out."""
+@dataclass(frozen=True)
+class _HostDots:
+    """Given points inside of the region, in volume space, along a curve that keeps neighbours together."""
+
+    position: np.ndarray  # float64 [n, 3]
+    normal: np.ndarray
+    radius: np.ndarray
+    material: np.ndarray
+    color: np.ndarray
+
+    @staticmethod
+    def gather(scans: Sequence[PointCloud], scene: DeviceScene, region: Region) -> _HostDots:
+        def joined(values: list[np.ndarray], *shape: int) -> np.ndarray:
+            return np.concatenate([np.zeros((0, *shape)), *values])
+
+        position = joined([(c.points - scene.origin) * scene.scale for c in scans], 3)
+        white = [np.ones((len(c.points), 3)) if c.colors is None else c.colors for c in scans]
+        inside = np.linalg.norm(position - np.asarray(region.center), axis=-1) < region.radius
+        chosen = np.flatnonzero(inside)
+        chosen = chosen[np.argsort(_morton(position[chosen]), kind="stable")]
+        return _HostDots(
+            position[chosen],
+            joined([c.normals for c in scans], 3)[chosen],
+            joined([c.radii * scene.scale for c in scans])[chosen],
+            joined([np.full(len(c.points), c.material) for c in scans])[chosen],
+            joined(white, 3)[chosen],
+        )
+
+    def upload(self, launcher: Launcher) -> Any:
+        dots = Dots()
+        for name in ("position", "normal", "color"):
+            setattr(dots, name, launcher.array(getattr(self, name).astype(np.float32), wp.vec3))
+        dots.radius = launcher.array(self.radius.astype(np.float32), wp.float32)
+        dots.material = launcher.array(self.material.astype(np.int32), wp.int32)
+        return dots
+
+
+def _morton(position: np.ndarray) -> np.ndarray:
+    """Places on the curve that visits a grid of 1024 cells an edge octant by octant."""
+    if not len(position):
+        return np.zeros(0, np.int64)
+    low, extent = position.min(0), np.ptp(position, axis=0).max()
+    cell = np.minimum((position - low) / max(extent, 1e-300) * 1024, 1023).astype(np.int64)
+    for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
+        cell = (cell | (cell << shift)) & mask
+    return cell @ np.array([1, 2, 4])
+
+
+def _pieces(triangles: np.ndarray, first: int, dots: _HostDots, region: Region, *, thin: bool) -> _HostPieces | None:
+    """Triangles cut until they are small for their distance from the focus, and dots; None where there is nothing.
+
+    Triangles outside of the region are left out.
+    """
     index = np.arange(len(triangles))
     corners = np.broadcast_to(np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]), (len(triangles), 3, 2)).copy()
     focus, center = np.asarray(region.focus), np.asarray(region.center)
@@ -128,11 +167,15 @@ def _pieces(triangles: np.ndarray, first: int, region: Region, *, thin: bool) ->
     index, corners = (np.concatenate(parts) for parts in zip(*done, strict=True)) if done else (index, corners)
     points = _points(triangles, index, corners)
     area = 0.5 * np.linalg.norm(np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]), axis=-1)
-    distance = np.linalg.norm(points.mean(1) - focus, axis=-1) / region.focus_radius
+    middle = np.concatenate([points.mean(1), dots.position])
+    area = np.concatenate([area, np.pi * dots.radius**2])
+    distance = np.linalg.norm(middle - focus, axis=-1) / region.focus_radius
     weight = area / (1.0 + distance**2) if thin else area
-    if not len(index) or weight.sum() <= 0.0:
+    if weight.sum() <= 0.0:
         return None
-    return _HostPieces(index + first, corners, area, weight)
+    index = np.concatenate([index + first, -1 - np.arange(len(dots.position))])
+    corners = np.concatenate([corners, np.zeros((len(dots.position), 3, 2))])
+    return _HostPieces(index, corners, area, weight)
 
 
 def _points(triangles: np.ndarray, index: np.ndarray, corners: np.ndarray) -> np.ndarray:
