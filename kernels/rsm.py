@@ -8,7 +8,7 @@ flux, so the flux that arrives does not depend on the number of texels.
 
 import warp as wp
 
-from warp_dvct.kernels.geometry import FAR, Geometry, trace_real, trace_synthetic
+from warp_dvct.kernels.geometry import FAR, Geometry, offset_point, trace_real, trace_synthetic
 from warp_dvct.kernels.lights import DISK, DISTANT, DOME, POINT, SPHERE, Lights, sample_dome, spot_factor
 from warp_dvct.kernels.materials import Materials, hemispherical_albedo, surface_at
 from warp_dvct.kernels.sampling import (
@@ -82,12 +82,16 @@ def emit_round(lights: Lights, i: int, target: Target, texel: wp.vec2, xi: wp.ve
 
 @wp.func
 def emit_planar(lights: Lights, i: int, target: Target, texel: wp.vec2, xi: wp.vec2) -> Beam:
-    """RECT and DISK: the cosine-weighted hemisphere, or the target's cap where that is narrower."""
+    """RECT and DISK: the cosine-weighted hemisphere, or the target's cap where that is narrower.
+
+    Beams start just off the light's plane: a ceiling in that plane must not stop them, as it stops no shadow ray.
+    """
     beam = Beam()
     st = wp.vec2(2.0 * xi[0] - 1.0, 2.0 * xi[1] - 1.0)
     if lights.kind[i] == DISK:
         st = concentric_disk(xi)
-    beam.origin = lights.position[i] + lights.axis_x[i] * st[0] + lights.axis_y[i] * st[1]
+    place = lights.position[i] + lights.axis_x[i] * st[0] + lights.axis_y[i] * st[1]
+    beam.origin = offset_point(place, lights.direction[i])
     toward = target.center - lights.position[i]
     distance = wp.length(toward)
     extent = wp.length(lights.axis_x[i]) + wp.length(lights.axis_y[i])
