@@ -60,12 +60,25 @@ def write_radiance(path: str | Path, pixels: np.ndarray) -> None:
     Raises:
         FileError: The file cannot be written; nothing is left behind.
     """
+    _write_float(path, {"RGB": np.ascontiguousarray(pixels, np.float32)})
+
+
+def write_depth_exr(path: str | Path, depth: np.ndarray) -> None:
+    """Write depth ``[h, w]`` as an EXR with the one 32-bit channel ``Z``.
+
+    Raises:
+        FileError: The file cannot be written; nothing is left behind.
+    """
+    _write_float(path, {"Z": np.ascontiguousarray(depth, np.float32)})
+
+
+def _write_float(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with replacing(Path(path)) as temporary:
         try:
-            with OpenEXR.File(header, {"RGB": np.ascontiguousarray(pixels, np.float32)}) as file:
+            with OpenEXR.File(header, dict(channels)) as file:
                 file.write(str(temporary))
         except (RuntimeError, OSError) as error:
             raise FileError(f"{path} cannot be written: {error}") from error
