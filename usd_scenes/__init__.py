@@ -42,7 +42,7 @@ def path(name: str) -> Path:
     text = file.read_text(encoding="utf-8")
     if BUNNY_ASSET not in text:
         return file
-    return _write_once(cache_folder() / "stages", name, text.replace(f"@{BUNNY_ASSET}@", f"@{_find_bunny()}@"))
+    return _write_once(cache_folder() / "stages", name, text.replace(f"@{BUNNY_ASSET}@", f"@{bunny_model()}@"))
 
 
 def cache_folder() -> Path:
@@ -50,7 +50,12 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "warp_dvct"
 
 
-def _find_bunny() -> str:
+def bunny_model() -> str:
+    """The Stanford bunny that the warp-lang package brings, a USD file.
+
+    Raises:
+        StageError: It is not there.
+    """
     spec = importlib.util.find_spec("warp")
     for folder in (spec and spec.submodule_search_locations) or []:
         file = Path(folder).parent / BUNNY_ASSET

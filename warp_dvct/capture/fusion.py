@@ -25,7 +25,7 @@ BYTES_PER_VOXEL = 20  # distance, weight and colour, all float32
 MEMORY_SHARE = 0.5  # of the memory that is free: the mesh needs the other half
 COUNT_STRIDE = 4  # pixels; of 2.7 cm at 4 m and f = 585, so no block of 16 voxels is stepped over
 SPARE_BLOCKS = 1.1  # the hash map rehashes, for seconds, when it is full
-# Disparity noise of structured light in 1/m: a sixth of a pixel at f = 585 px and a baseline of 75 mm (Khoshelham 2012).
+# Noise of 1/depth [1/m] of structured light: 1/6 pixel at f = 585 px and a baseline of 75 mm (Khoshelham 2012).
 INVERSE_DEPTH_NOISE = 1.0 / 6.0 / (585.0 * 0.075)
 SMOOTH_WINDOW = 7  # pixels across
 SMOOTH_RANGE = 5.0  # standard deviations of the noise that still count as the same surface
@@ -181,8 +181,8 @@ def _check_memory(blocks: int, options: FusionOptions) -> None:
         # Blocks near a surface grow with its area in blocks.
         fitting = options.voxel * np.sqrt(needed / (MEMORY_SHARE * free))
         raise DeviceError(
-            f"voxels of {options.voxel:g} m need {needed / 2**30:.1f} GiB for {blocks} blocks, of {free / 2**30:.1f} GiB"
-            f" free; give --voxel {fitting:.2g} or more, or a smaller --far"
+            f"voxels of {options.voxel:g} m need {needed / 2**30:.1f} GiB for {blocks} blocks, of"
+            f" {free / 2**30:.1f} GiB free; give --voxel {fitting:.2g} or more, or a smaller --far"
         )
 
 

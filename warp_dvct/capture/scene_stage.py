@@ -12,8 +12,9 @@ import numpy as np
 
 from warp_dvct.capture.fusion import FusedMesh
 from warp_dvct.capture.intrinsics import FLIP
+from warp_dvct.capture.overlay import overlay, relative, save
 from warp_dvct.capture.stage import Capture, Placement
-from warp_dvct.errors import FileError, OptionError, StageError
+from warp_dvct.errors import OptionError, StageError
 from warp_dvct.image import replacing, write_text
 from warp_dvct.usd.stage import open_stage, quiet_diagnostics, world_frame
 
@@ -80,40 +81,14 @@ def write_scene(
         raise StageError(f"{capture.depth_path} of '{capture.path}' has no prim above it; put it below an Xform")
     with quiet_diagnostics():
         _write_mesh(mesh_file(target), mesh, np.linalg.inv(capture.world))
-        if lights is not None and lights.layer is not None:
-            write_text(lights_file(target), lights.layer)
-        with replacing(target) as temporary:
-            stage = _new_scene(temporary, target, capture, root)
-            _author_mesh(stage, root, mesh_file(target).name, mesh, facts or {})
-            if poses is not None:
-                _author_poses(stage, capture, poses)
-            if lights is not None:
-                _author_lights(stage, root, target, lights, np.linalg.inv(capture.world))
-            _save(stage.GetRootLayer(), target)
-            del stage
-
-
-def _new_scene(temporary: Path, target: Path, capture: Capture, root: str) -> Usd.Stage:
-    """A stage over the capture, with its frame range, axes and units."""
-    from pxr import Sdf, Usd, UsdGeom
-
-    below = open_stage(capture.path)
-    stage = Usd.Stage.CreateNew(str(temporary))
-    stage.GetRootLayer().subLayerPaths.append(_relative(capture.path, target.parent))
-    default = below.GetDefaultPrim()
-    stage.GetRootLayer().defaultPrim = (default.GetPath() if default else Sdf.Path(root).GetPrefixes()[0]).name
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.GetStageUpAxis(below))
-    UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.GetStageMetersPerUnit(below))
-    stage.SetFramesPerSecond(below.GetFramesPerSecond())
-    stage.SetTimeCodesPerSecond(below.GetTimeCodesPerSecond())
-    stage.SetStartTimeCode(capture.times[0])
-    stage.SetEndTimeCode(capture.times[-1])
-    return stage
-
-
-def _relative(file: str, folder: Path) -> str:
-    relative = os.path.relpath(os.path.abspath(file), folder)
-    return relative if relative.startswith("..") else f"./{relative}"
+    if lights is not None and lights.layer is not None:
+        write_text(lights_file(target), lights.layer)
+    with overlay(capture.path, target) as stage:
+        _author_mesh(stage, root, mesh_file(target).name, mesh, facts or {})
+        if poses is not None:
+            _author_poses(stage, capture, poses)
+        if lights is not None:
+            _author_lights(stage, root, target, lights, np.linalg.inv(capture.world))
 
 
 def _write_mesh(file: Path, mesh: FusedMesh, to_local: np.ndarray) -> None:
@@ -142,7 +117,7 @@ def _write_mesh(file: Path, mesh: FusedMesh, to_local: np.ndarray) -> None:
         else:
             colors = np.ascontiguousarray(np.clip(mesh.colors, 0.0, 1.0), np.float32)
             prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(colors))
-        _save(stage.GetRootLayer(), file)
+        save(stage.GetRootLayer(), file)
         del stage
 
 
@@ -214,13 +189,4 @@ def _author_lights(stage: Usd.Stage, root: str, target: Path, lights: SceneLight
     for key, value in lights.data.items():
         group.GetPrim().SetCustomDataByKey(f"dvct:{key}", value)
     inner = stage.DefinePrim(f"{root}/Lights/Real")
-    inner.GetReferences().AddReference(_relative(str(file), target.parent))
-
-
-def _save(layer: Any, target: Path) -> None:
-    from pxr import Tf
-
-    try:
-        layer.Save()
-    except Tf.ErrorException as error:
-        raise FileError(f"{target} cannot be written: {error}; is the disk full?") from error
+    inner.GetReferences().AddReference(relative(str(file), target.parent))

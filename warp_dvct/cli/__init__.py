@@ -14,6 +14,7 @@ import click
 
 from warp_dvct.cli.bench import bench
 from warp_dvct.cli.capture import capture
+from warp_dvct.cli.place import place
 from warp_dvct.cli.plan import plan
 from warp_dvct.cli.probe import probe
 from warp_dvct.cli.reconstruct import reconstruct
@@ -35,6 +36,7 @@ def cli() -> None:
 
 for command in (bench, relight, plan, probe, reconstruct, settings, scenes, warmup, capture):
     cli.add_command(command)
+capture.add_command(place)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

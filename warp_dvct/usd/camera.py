@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def choose_camera(ctx: Context, name: str | None) -> Usd.Prim:
-    """The camera of that path or unique name, or the only one of the stage.
+    """The camera of that path or unique name; else the only one of the stage, or the only one with a plate.
 
     Raises:
         StageError: There is none, the name fits none or several, or there are several and none was chosen.
@@ -36,9 +36,11 @@ def choose_camera(ctx: Context, name: str | None) -> Usd.Prim:
         raise StageError(f"{stage} has no camera; add a UsdGeomCamera")
     listed = ", ".join(str(prim.GetPath()) for prim in cameras)
     if name is None:
-        if len(cameras) > 1:
+        with_plate = [prim for prim in cameras if prim.GetAttribute("dvct:plate:file")]
+        chosen = with_plate if len(with_plate) == 1 else cameras
+        if len(chosen) > 1:
             raise StageError(f"{stage} has several cameras; choose one by --camera: {listed}")
-        return cameras[0]
+        return chosen[0]
     fitting = [prim for prim in cameras if name in (str(prim.GetPath()), prim.GetName())]
     exact = [prim for prim in fitting if str(prim.GetPath()) == name]
     if len(exact or fitting) != 1:
