@@ -9,6 +9,7 @@ import click
 from tqdm import tqdm
 
 SHOWN = 10  # frames that were left out, listed one by one
+CLIPPED = 0.01  # share of clipped pixels from which it is said
 
 
 class Numbers(click.ParamType):
@@ -43,7 +44,7 @@ class Bar:
 
 @click.group()
 def capture() -> None:
-    """Bring in captures from depth cameras, simulate them."""
+    """Import captures from depth cameras, simulate them."""
 
 
 @capture.command("import")
@@ -102,3 +103,63 @@ def check_stage_name(output: str) -> None:
     """
     if not output.lower().endswith((".usda", ".usdc", ".usd")):
         raise click.UsageError(f"OUTPUT is '{output}'; its name must end in .usda, .usdc or .usd")
+
+
+@capture.command()
+@click.argument("stage")
+@click.option("-o", "--output", required=True, metavar="FOLDER", help="Folder for capture.usda, truth.usda and images.")
+@click.option("--frames", type=click.IntRange(min=1), default=60, show_default=True, help="How many.")
+@click.option(
+    "--size", type=click.IntRange(min=8), nargs=2, default=(640, 480), show_default=True, metavar="WIDTH HEIGHT"
+)
+@click.option(
+    "--path",
+    type=click.Choice(["auto", "stage", "orbit", "handheld"]),
+    default="auto",
+    show_default=True,
+    help="Of the camera: the stage's own where it is animated, an arc about what it looks at, or a hand's.",
+)
+@click.option("--arc", type=float, default=50.0, show_default=True, metavar="DEGREES", help="Of an orbit.")
+@click.option("--camera", "-cam", metavar="PATH", help="Camera of the stage. Needed where there are several.")
+@click.option("--unregistered", is_flag=True, help="Colour from a camera of its own, 25 mm to the right.")
+@click.option("--no-noise", is_flag=True, help="Measure the true depth.")
+@click.option(
+    "--without",
+    multiple=True,
+    type=click.Choice(["disparity", "quantization", "lateral", "jumps", "incidence", "range"]),
+    help="Leave out one effect of the sensor. May be repeated.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the noise and the hand.")
+@click.option("--exposure", type=float, default=0.0, show_default=True, metavar="STOPS", help="Of the photographs.")
+@click.option(
+    "--quality", type=click.Choice(["draft", "balanced", "high"]), default="draft", show_default=True, help="Of light."
+)
+@click.option("--device", default="cpu", show_default=True, metavar="DEVICE", help="cpu, cuda or cuda:N.")
+@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="CPU threads. Default: all cores.")
+def simulate(
+    stage: str,
+    output: str,
+    size: tuple[int, int],
+    no_noise: bool,
+    without: tuple[str, ...],
+    camera: str | None,
+    device: str,
+    threads: int | None,
+    **options: Any,
+) -> None:
+    """Record the real part of STAGE with a simulated Kinect v1, and write the truth beside it."""
+    from warp_dvct.capture.noise import EFFECTS, KinectNoise
+    from warp_dvct.capture.simulate import Simulation
+    from warp_dvct.capture.simulate import simulate as record
+    from warp_dvct.cli.quiet import start_warp
+
+    start_warp(device)
+    noise = KinectNoise.only(*(e for e in EFFECTS if not no_noise and e not in without))
+    asked = Simulation(width=size[0], height=size[1], noise=noise, **options)
+    with Bar("simulating") as bar:
+        done = record(stage, output, asked, camera=camera, device=device, threads=threads, progress=bar)
+    if done.clipped > CLIPPED:
+        click.echo(
+            f"warp-dvct: warning: {done.clipped:.0%} of the photographs' pixels are clipped; lower --exposure", err=True
+        )
+    click.echo(f"{done.capture}: {asked.frames} frames, {done.valid:.0%} of the depth measured; truth in {done.truth}")
