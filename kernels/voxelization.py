@@ -457,7 +457,11 @@ def _sum_areas(
     records: int,
     area_out: wp.array(dtype=wp.vec2),
 ):
-    """Projected front-facing area of each face of a record, before (real) and after (all), in voxel faces."""
+    """Projected front-facing area of each face of a record, before (real) and after (all), in voxel faces.
+
+    Where both kinds together exceed the face, one lies over the other (a rug on a floor): the light that reaches the
+    face is then spread over the face, not over what is hidden as well.
+    """
     i = first + wp.tid()
     end = fragments
     if i + 1 < records:
@@ -476,7 +480,7 @@ def _sum_areas(
                 synthetic += shown * fragment_in[fragment][3]
             else:
                 real += shown * fragment_in[fragment][3]
-        area_out[i * 6 + face] = wp.vec2(real, real + synthetic)
+        area_out[i * 6 + face] = wp.vec2(real, wp.min(real + synthetic, wp.max(wp.max(real, synthetic), 1.0)))
 
 
 @wp.kernel

@@ -38,7 +38,10 @@ def area_in_cube(triangle: np.ndarray, low: np.ndarray, edge: float) -> float:
 
 
 def twin(triangles, roles, sides, n) -> np.ndarray:
-    """Every triangle against every voxel of the unit cube: ``[x, y, z, face, solution]`` in voxel faces."""
+    """Every triangle against every voxel of the unit cube: ``[x, y, z, face, solution]`` in voxel faces.
+
+    What real and synthetic surfaces have together beyond a whole face is hidden by the other.
+    """
     out = np.zeros((n, n, n, 6, 2))
     unit = lit.cross_of(triangles)
     unit = unit / np.linalg.norm(unit, axis=-1, keepdims=True)
@@ -50,6 +53,8 @@ def twin(triangles, roles, sides, n) -> np.ndarray:
                 out[cell][:, 1] += area * shown
                 if role == Role.REAL:
                     out[cell][:, 0] += area * shown
+    real, synthetic = out[..., 0], out[..., 1] - out[..., 0]
+    out[..., 1] = np.minimum(real + synthetic, np.maximum(np.maximum(real, synthetic), 1.0))
     return out
 
 
