@@ -106,17 +106,22 @@ def measure(stage: str, options: PeerOptions) -> PeerReport:
     rows: list[PeerRow] = []
 
     def add(name: str, picture: Callable[[], np.ndarray]) -> None:
-        wall, cpu = time.perf_counter(), time.process_time()
-        comp = picture()
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        comp, wall, cpu = timed(picture)
         error = flip_ldr(truth.comp, comp)[1]
         rows.append(
             PeerRow(name, wall, cpu, float(error.mean()), float(error[affected].mean()), rmse(truth.comp, comp))
         )
 
     _add_ours(add, scene, truth, options)
-    left_out, notes = _add_mitsuba(add, scene, truth, options)
+    left_out, notes = add_mitsuba(add, scene, truth, options)
     return PeerReport(Path(stage).stem, options.width, height, truth.noise, rows, left_out, notes)
+
+
+def timed(picture: Callable[[], np.ndarray]) -> tuple[np.ndarray, float, float]:
+    """A picture, and the seconds that it took: of the clock, and of all threads."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    made = picture()
+    return made, time.perf_counter() - wall, time.process_time() - cpu
 
 
 def _add_ours(add: Callable[..., None], scene: Scene, truth: Reference, options: PeerOptions) -> None:
@@ -138,7 +143,7 @@ def _add_ours(add: Callable[..., None], scene: Scene, truth: Reference, options:
         add(name, lambda relighter=relighter: relighter.render(plate=truth.before).comp)
 
 
-def _add_mitsuba(
+def add_mitsuba(
     add: Callable[..., None], scene: Scene, truth: Reference, options: PeerOptions
 ) -> tuple[list[str], str]:
     """Rows of Mitsuba; returns who is left out, and how the materials were mapped."""

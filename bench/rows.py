@@ -32,8 +32,13 @@ def provenance() -> dict[str, Any]:
         "machine": describe_machine(),
         "versions": versions,
         "commit": commit(),
-        "time": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "time": now(),
     }
+
+
+def now() -> str:
+    """The time of a row, UTC."""
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
 def describe_machine() -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import click
 from warp_dvct.bench.options import settings_of
 from warp_dvct.cli.options import METHODS, QUALITIES
 from warp_dvct.cli.quiet import start_warp
+from warp_dvct.usd_scenes import cache_folder
 
 FILE = click.Path(path_type=Path)
 
@@ -43,10 +45,73 @@ def backends(stages: tuple[str, ...], pairs: tuple[str, ...], devices, threads, 
     for stage in stages or ("room_area",):
         rows = [{**row, **taken} for row in module.measure(stage, found, options)]
         click.echo(module.format_rows(rows) + "\n")
-        for row in rows if out is not None else ():
-            append_row(out, row)
+        if out is not None:
+            for row in rows:
+                append_row(out, row)
     if not any(b.device.startswith("cuda") for b in found):
         click.echo("no CUDA device was measured: none is present" if not devices else "no CUDA device was asked for")
+
+
+@click.command()
+@click.option("--stage", "stages", multiple=True, help="A bundled stage or a USD file; repeatable. Default: room_area.")
+@click.option("--method", "methods", multiple=True, help="Repeatable. Default: all three.")
+@click.option(
+    "--knob",
+    "knobs",
+    multiple=True,
+    metavar="NAME[=A,B]",
+    help="A sweep, with values of your own, 'preset' or 'joint'; repeatable. Default: all, and Mitsuba 3.",
+)
+@click.option("--width", type=int, default=320, show_default=True, help="Pixels across; the height follows the camera.")
+@click.option("--spp", "samples", type=int, default=128, show_default=True, help="Samples per pixel of the truth.")
+@click.option("--bounces", type=int, default=8, show_default=True, help="Of the truth and of all points but presets.")
+@click.option("--flicker", type=int, default=3, show_default=True, help="Frames of a moving shot; 0 for none.")
+@click.option("--repeats", type=int, default=2, show_default=True, help="Timed frames a point; the least counts.")
+@click.option("--peers/--no-peers", default=True, show_default=True, help="Mitsuba 3, where it is installed.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Of the truth's random numbers.")
+@click.option("--cache", type=FILE, help="References; default: warp_dvct in the user's cache.")
+@click.option("--out", type=FILE, default=Path("tradeoff"), show_default=True, help="Folder: rows, pictures, fronts.")
+@click.option("--html", type=FILE, metavar="DIR", help="Also write one self-contained page there.")
+@click.option("--device", default="cpu", show_default=True, help="cpu or cuda:N.")
+@click.option("--threads", type=int, help="CPU threads; all cores by default.")
+def tradeoff(stages: tuple[str, ...], cache: Path | None, html: Path | None, **rest: Any) -> None:
+    """Every knob of every method: time against error, fronts, and what each knob buys; resumes where it stopped."""
+    start_warp(rest["device"])
+    from warp_dvct.bench import pareto
+    from warp_dvct.bench import tradeoff as module
+    from warp_dvct.bench.page import write_page
+
+    command = repeat_command()
+    measured = {}
+    options = module.TradeoffOptions(cache=cache or cache_folder() / "references", **rest)
+    for stage in stages or ("room_area",):
+        bench = module.Bench(stage, options, lambda row, known: click.echo(module.format_row(row) + " ·" * known))
+        click.echo(f"{stage}, {options.width} x {bench.height}; points marked · were measured before\n{module.HEAD}")
+        rows = bench.run()
+        click.echo(module.summarise(rows))
+        for reason in bench.left_out:
+            click.echo(f"left out: {reason}")
+        for file in pareto.draw(rows, options.out / f"front_{Path(stage).stem}"):
+            click.echo(str(file))
+        measured[Path(stage).stem] = rows
+    if html is not None:
+        click.echo(str(write_page(html, options.out, measured, [command])))
+
+
+def repeat_command() -> str:
+    """The command line that is being run, with what differs from the defaults."""
+    context = click.get_current_context()
+    words = ["warp-dvct", "bench", str(context.info_name)]
+    for parameter in context.command.params:
+        value, flag = context.params.get(str(parameter.name)), parameter.opts[0]
+        if value in (None, (), parameter.get_default(context)):
+            continue
+        if isinstance(value, bool):
+            words.append(flag if value else parameter.secondary_opts[0])
+            continue
+        for item in value if isinstance(value, tuple) else (value,):
+            words += [flag, str(item)]
+    return shlex.join(words)
 
 
 def _some_rows(file: Path, kind: str) -> list[dict[str, Any]]:
@@ -59,4 +124,4 @@ def _some_rows(file: Path, kind: str) -> list[dict[str, Any]]:
     return rows
 
 
-TRADE_COMMANDS = (backends,)
+TRADE_COMMANDS = (backends, tradeoff)
