@@ -53,7 +53,7 @@ class Model:
     Attributes:
         to_metres: 3x3 from the model's units and axes to metres, y up.
         low, high: Its bounds in metres, y up.
-        name: Of its default prim.
+        name: Of the file, without its ending.
     """
 
     to_metres: np.ndarray
@@ -83,7 +83,7 @@ def read_model(file: str) -> Model:
     corners = np.array([np.array(box.GetCorner(i)) for i in range(8)]) @ to_metres.T
     if not np.isfinite(corners).all() or np.ptp(corners, axis=0).max() <= 0.0:
         raise StageError(f"'{file}': {prim.GetPath()} has no size")
-    return Model(to_metres, corners.min(0), corners.max(0), prim.GetName())
+    return Model(to_metres, corners.min(0), corners.max(0), Path(file).stem)
 
 
 def footprint(model: Model, thing: PlacedObject) -> float:

@@ -43,6 +43,7 @@ SKIPPED_SHOWN = 10
 )
 @click.option("--close-holes", type=click.FloatRange(0.0), default=0.0, metavar="METRES", help="Up to that radius.")
 @click.option("--triangles", type=click.IntRange(min=4), metavar="N", help="Decimate the mesh to that many.")
+@click.option("--probe", metavar="FILE", help="Lights of the real scene, as `warp-dvct probe` writes them.")
 @click.option("--camera", metavar="PATH", help="Depth camera; needed where the stage has several.")
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="CPU threads. Default: all cores.")
 def reconstruct(
@@ -57,6 +58,7 @@ def reconstruct(
     least_area: float | None,
     close_holes: float,
     triangles: int | None,
+    probe: str | None,
     camera: str | None,
     threads: int | None,
 ) -> None:
@@ -65,7 +67,7 @@ def reconstruct(
         raise click.UsageError(f"OUTPUT is '{output}'; its name must end in .usda, .usd or .usdc")
     check_writable(output)
     from warp_dvct.capture.fusion import FusionOptions, fuse
-    from warp_dvct.capture.scene_stage import write_scene
+    from warp_dvct.capture.scene_stage import SceneLights, write_scene
     from warp_dvct.capture.source import CaptureFrames
     from warp_dvct.capture.stage import open_capture
 
@@ -83,7 +85,8 @@ def reconstruct(
     opened = open_capture(capture, camera=camera)
     with Progress(os.path.basename(output)) as progress:
         mesh = fuse(CaptureFrames(opened), options, threads=threads, progress=progress.update)
-    write_scene(output, opened, mesh, facts={"voxel": voxel})
+    lights = None if probe is None else SceneLights(file=probe)
+    write_scene(output, opened, mesh, lights=lights, facts={"voxel": voxel})
     _report_skipped(mesh.skipped, len(opened))
     click.echo(
         f"{output}: {len(mesh.triangles)} triangles from {mesh.frames} of {len(opened)} frames;"
