@@ -78,6 +78,14 @@ def plan_passes(
             pixels * 48,
         ),
         PassPlan(
+            "history",
+            lit and settings.vpls_frames > 1,
+            f"mean of up to {settings.vpls_frames} frames while only the camera moves"
+            if settings.vpls_frames > 1
+            else "vpls.frames=1: each frame by itself",
+            int(1.2 * pixels * (POINT_BYTES + 76)) if settings.vpls_frames > 1 else 0,
+        ),
+        PassPlan(
             "glossy",
             lit and glossy,
             "by rays" if lit and glossy else "no material has a specular lobe smoother than glossy.roughness",

@@ -25,8 +25,8 @@ METHODS = ("delta-cones", "instant-radiosity", "path-trace")
 DEFAULT_WIDTH = 960
 
 Progress = Callable[[str, float], None]
-Lit = delta_cone_tracing.LightField | instant_radiosity.VplSet  # what a method keeps while only the camera moves
-LitKind = TypeVar("LitKind", delta_cone_tracing.LightField, instant_radiosity.VplSet)
+Lit = delta_cone_tracing.LightField | instant_radiosity.Shot  # what a method keeps while only the camera moves
+LitKind = TypeVar("LitKind", delta_cone_tracing.LightField, instant_radiosity.Shot)
 
 
 class Relighter:
@@ -230,16 +230,13 @@ class Relighter:
     def _instant_radiosity(self, plate: np.ndarray | None, report: Progress) -> Radiance:
         report("virtual point lights", 0.0)
         launcher, scene, plan = self._launcher, self.scene, self.plan
-        device_scene, lights = self._lit(
-            instant_radiosity.VplSet,
-            lambda uploaded: instant_radiosity.make_vpls(launcher, scene, uploaded, plan),
+        device_scene, shot = self._lit(
+            instant_radiosity.Shot, lambda uploaded: instant_radiosity.Shot(launcher, scene, uploaded, plan)
         )
-        self._method_notices = lights.notices
         report("shading", 0.3)
         tonemapped = plate is not None and plan.settings.difference == "tonemapped" and plan.changes
-        radiance = instant_radiosity.render(
-            launcher, scene, device_scene, lights, plan, with_before=plate is None or tonemapped
-        )
+        radiance = shot.render(launcher, scene, device_scene, plan, with_before=plate is None or tonemapped)
+        self._method_notices = shot.notices
         return tonemap_difference(launcher, radiance, plate) if plate is not None and tonemapped else radiance
 
     def _path_trace(self, report: Progress) -> Radiance:

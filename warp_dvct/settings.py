@@ -97,6 +97,9 @@ class Settings:
     vpls_tiles: int = _knob(
         4, "edge of the tiles whose pixels share the VPLs out; 1 for all at every pixel", low=1, high=16
     )
+    vpls_frames: int = _knob(
+        1, "most frames that are averaged, each with its own VPLs, while only the camera moves", low=1, high=2**16
+    )
     vpls_sources: int = _knob(4, "VPLs that a candidate for a further bounce tries", low=1, high=1024)
     vpls_slots: str = _knob("drawn", "which candidate gets a slot of a further bounce", choices=("drawn", "strongest"))
     ism_size: int = _knob(128, "texels an edge of an imperfect shadow map", low=8, high=2048)

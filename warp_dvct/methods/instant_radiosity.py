@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
+from warp_dvct.kept import content_key
 from warp_dvct.kernels import shading, specular
 from warp_dvct.kernels.vpls import Vpls
 from warp_dvct.launch import Launcher
@@ -22,6 +23,7 @@ from warp_dvct.layers import Radiance
 from warp_dvct.passes.environment import build_environment
 from warp_dvct.passes.gather import shade_indirect
 from warp_dvct.passes.gbuffer import GBuffer, render_gbuffer
+from warp_dvct.passes.history import Blender, History
 from warp_dvct.passes.ism import draw_isms, new_isms, ray_sight
 from warp_dvct.passes.point_cloud import SurfacePoints, sample_surfaces
 from warp_dvct.passes.resolve import resolve
@@ -38,6 +40,8 @@ from warp_dvct.passes.vpl_shading import (
 from warp_dvct.passes.vpls import Region, choose_sky, choose_vpls, light_maps, new_vpls, spread_vpls
 from warp_dvct.plan import Plan
 from warp_dvct.scene import Light, LightKind, LightRole, Notice, Role, Scene
+
+SEED_STEP = 104_729  # between the random numbers of a shot's frames
 
 
 @dataclass(frozen=True)
@@ -225,89 +229,157 @@ def _bounds(scene: Scene, device_scene: DeviceScene, role: Role | None) -> tuple
     return low, high
 
 
-def render(
-    launcher: Launcher, scene: Scene, device_scene: DeviceScene, lights: VplSet, plan: Plan, *, with_before: bool
-) -> Radiance:
-    """Shade what the camera sees in both solutions at once (eqs. 1-8): direct, VPLs, reflections, resolve.
+class Shot:
+    """Frames of one scene in which nothing but the camera moves: a moved light or object begins another shot.
 
-    Args:
-        with_before: Also render the real scene alone, to serve as the plate.
+    With ``vpls.frames`` at 1 all frames have the same VPLs and equal frames from scratch. Above, each frame draws its
+    own and is blended with those before it; as a mean of k frames has k times the VPLs, their discs shrink alike, so
+    that the clamp's bias vanishes too. The first frame equals one from scratch always.
     """
+
+    def __init__(self, launcher: Launcher, scene: Scene, device_scene: DeviceScene, plan: Plan) -> None:
+        self.lights: VplSet | None = make_vpls(launcher, scene, device_scene, plan)
+        self._frame = 0
+        self._history: History | None = None
+
+    @property
+    def notices(self) -> tuple[Notice, ...]:
+        """What could not be done in the last frame."""
+        return self.lights.notices if self.lights is not None else ()
+
+    def render(
+        self, launcher: Launcher, scene: Scene, device_scene: DeviceScene, plan: Plan, *, with_before: bool
+    ) -> Radiance:
+        """The next frame; ``scene`` and ``plan`` may differ from the last one's in camera, picture size and plate.
+
+        Args:
+            with_before: Also render the real scene alone, to serve as the plate.
+        """
+        most = plan.settings.vpls_frames
+        this = frame_plan(plan, self._frame)
+        if self._frame > 0 and most > 1:
+            self.lights = None  # free the last frame's maps first
+            self.lights = make_vpls(launcher, scene, device_scene, this)
+        assert self.lights is not None
+        with launcher.scope("gbuffer"):
+            buffer = render_gbuffer(
+                launcher,
+                device_scene,
+                plan.width,
+                plan.height,
+                edge_samples=plan.settings.antialias,
+                behind=with_before,
+                seed=plan.settings.seed,
+            )
+        blender = None
+        if most > 1 and (plan.changes or with_before):
+            view = content_key(scene.camera, plan.width, plan.height, with_before)
+            known = self._history if self._history is not None and self._history.with_before == with_before else None
+            blender = Blender(launcher, known, buffer, view, with_before, device_scene.camera, most)
+        shader = _Shader(launcher, scene, device_scene, self.lights, this, with_before, blender)
+        radiance = shader.picture(buffer)
+        self._history = blender.history() if blender is not None else None
+        self._frame += 1
+        return radiance
+
+
+def frame_plan(plan: Plan, frame: int) -> Plan:
+    """The plan with the random numbers of frame 0, 1 … of a shot, and discs for the VPLs of all frames up to it."""
     settings = plan.settings
-    with launcher.scope("gbuffer"):
-        buffer = render_gbuffer(
-            launcher,
-            device_scene,
-            plan.width,
-            plan.height,
-            edge_samples=settings.antialias,
-            behind=with_before,
-            seed=settings.seed,
-        )
-    light = launcher.zeros(buffer.count, wp.vec3)
-    before = launcher.zeros(buffer.count if with_before else 1, wp.vec3)
-    hidden_before = launcher.zeros(max(1, buffer.behind_count), wp.vec3)
-    if plan.changes or with_before:
-        shader = _Shader(launcher, scene, device_scene, lights, plan)
-        shader.shade(buffer.points, buffer.count, light, before, with_before, buffer)
-        if with_before:
-            spare = launcher.zeros(max(1, buffer.behind_count), wp.vec3)
-            shader.shade(buffer.behind, buffer.behind_count, spare, hidden_before, True, None)
-    with launcher.scope("resolve"):
-        return resolve(
-            launcher,
-            device_scene,
-            buffer,
-            lights.env,
-            light=light,
-            before=before,
-            behind_before=hidden_before,
-            with_before=with_before,
-        )
+    if frame == 0 or settings.vpls_frames == 1:
+        return plan
+    frames = min(frame + 1, settings.vpls_frames)
+    seed = (settings.seed + SEED_STEP * frame) % 2**31
+    return replace(plan, settings=replace(settings, seed=seed, vpls_clamp=settings.vpls_clamp / frames**0.5))
 
 
 @dataclass(frozen=True)
 class _Shader:
-    """Lights points: those of a picture, or real surfaces behind synthetic ones (``buffer`` is None)."""
+    """Shades what the camera sees in both solutions at once (eqs. 1-8): direct, reflections, VPLs, resolve."""
 
     launcher: Launcher
     scene: Scene
     device_scene: DeviceScene
     lights: VplSet
     plan: Plan
+    with_before: bool
+    blender: Blender | None
 
-    def shade(
-        self, points: Any, count: int, light: Any, before: Any, with_before: bool, buffer: GBuffer | None
-    ) -> None:
-        """Write the light of ``count`` points: after on synthetic ones, after - before on real ones, and before."""
-        launcher, plan, lights = self.launcher, self.plan, self.lights
-        with launcher.scope("direct"):
-            self._direct(points, count, light, before, with_before)
-        source = VplLight(self.device_scene, lights.vpls, lights.sight, plan.settings.vpls_tiles, with_before)
-        if lights.ends[-1] > 0:
-            with launcher.scope("vpl shading"):
-                irradiance = (
-                    light_picture(launcher, buffer, source)
-                    if buffer is not None
-                    else light_points(launcher, points, count, source)
-                )
-                shade_indirect(
-                    launcher,
-                    points,
-                    count,
-                    irradiance,
-                    alpha_max=plan.alpha_max,
-                    light=light,
-                    before=before,
-                    with_before=with_before,
-                )
-        if plan.glossy and (plan.settings.bounces or lights.env.levels):
-            with launcher.scope("glossy"):
-                self._glossy(source, points, count, light, before)
+    def picture(self, buffer: GBuffer) -> Radiance:
+        """Shade a G-buffer and average its points."""
+        launcher = self.launcher
+        light = launcher.zeros(buffer.count, wp.vec3)
+        before = launcher.zeros(buffer.count if self.with_before else 1, wp.vec3)
+        hidden_before = launcher.zeros(max(1, buffer.behind_count), wp.vec3)
+        if self.plan.changes or self.with_before:
+            self._shade_buffer(buffer, light, before)
+            if self.with_before:
+                self._shade_behind(buffer, hidden_before)
+        with launcher.scope("resolve"):
+            return resolve(
+                launcher,
+                self.device_scene,
+                buffer,
+                self.lights.env,
+                light=light,
+                before=before,
+                behind_before=hidden_before,
+                with_before=self.with_before,
+            )
 
-    def _direct(self, points: Any, count: int, light: Any, before: Any, with_before: bool) -> None:
+    def _shade_buffer(self, buffer: GBuffer, light: Any, before: Any) -> None:
+        """Write the light of all points: after on synthetic ones, after - before on real ones, and before."""
+        self._seen(buffer.points, buffer.count, light, before)
+        if self.blender is not None:
+            self.blender.seen("light", light)
+            self.blender.seen("before", before)
+        with self.launcher.scope("vpl shading"):
+            irradiance = light_picture(self.launcher, buffer, self._source)
+            if self.blender is not None:
+                self.blender.irradiance(*irradiance)
+            self._reflect(buffer.points, buffer.count, irradiance, light, before)
+
+    def _shade_behind(self, buffer: GBuffer, before: Any) -> None:
+        """Write the light before of the real surfaces behind synthetic points."""
+        points, count = buffer.behind, buffer.behind_count
+        spare = self.launcher.zeros(max(1, count), wp.vec3)
+        self._seen(points, count, spare, before)
+        with self.launcher.scope("vpl shading"):
+            irradiance = light_points(self.launcher, points, count, self._source)
+            self._reflect(points, count, irradiance, spare, before)
+        if self.blender is not None:
+            self.blender.seen("behind", before)
+
+    @property
+    def _source(self) -> VplLight:
+        return VplLight(
+            self.device_scene, self.lights.vpls, self.lights.sight, self.plan.settings.vpls_tiles, self.with_before
+        )
+
+    def _seen(self, points: Any, count: int, light: Any, before: Any) -> None:
+        """Write direct light and add glossy reflections."""
+        with self.launcher.scope("direct"):
+            self._direct(points, count, light, before)
+        if self.plan.glossy and (self.plan.settings.bounces or self.lights.env.levels):
+            with self.launcher.scope("glossy"):
+                self._glossy(points, count, light, before)
+
+    def _reflect(self, points: Any, count: int, irradiance: tuple[Any, Any], light: Any, before: Any) -> None:
+        """Add diffusely reflected irradiance."""
+        shade_indirect(
+            self.launcher,
+            points,
+            count,
+            irradiance,
+            alpha_max=self.plan.alpha_max,
+            light=light,
+            before=before,
+            with_before=self.with_before,
+        )
+
+    def _direct(self, points: Any, count: int, light: Any, before: Any) -> None:
         """Direct light of all but domes (eqs. 1-5)."""
-        direct = direct_settings(self.plan, self.lights.region, self.scene, with_before)
+        direct = direct_settings(self.plan, self.lights.region, self.scene, self.with_before)
         if self.plan.settings.shadow_maps == "single":
             shade_direct_single(
                 self.launcher,
@@ -323,14 +395,15 @@ class _Shader:
         else:
             shade_direct(self.launcher, self.device_scene, points, count, direct, light=light, before=before)
 
-    def _glossy(self, source: VplLight, points: Any, count: int, light: Any, before: Any) -> None:
+    def _glossy(self, points: Any, count: int, light: Any, before: Any) -> None:
         plan, settings = self.plan, self.plan.settings
         glossy = specular.Glossy()
         glossy.rays, glossy.light_samples, glossy.seed = settings.glossy_rays, settings.shadows_samples, settings.seed
         glossy.alpha_max, glossy.again = plan.alpha_max, int(settings.bounces > 0)
         index, found = find_glossy(self.launcher, points, count, plan.alpha_max)
         # What a reflection shows has made one bounce already: the last bounce's VPLs would be one too many.
-        shown = replace(source, vpls=first_vpls(source.vpls, self.lights.ends[max(0, len(self.lights.ends) - 2)]))
+        ends = self.lights.ends
+        shown = replace(self._source, vpls=first_vpls(self.lights.vpls, ends[max(0, len(ends) - 2)]))
         shade_glossy(self.launcher, shown, self.lights.env, points, index, found, glossy, out=light, before=before)
 
 
