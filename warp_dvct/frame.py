@@ -17,6 +17,7 @@ from warp_dvct.scene import Role, Scene
 
 STEPS_PER_OCTAVE = 4  # of the fine volume's edge: it is within 2**(1/8), 9 %, of what volume.scale asks for
 STEPS_PER_EDGE = 8  # of the fine volume's centre: it is within a sixteenth of the edge from the objects' middle
+SPLIT_TO = 0.25  # of the coarse volume's half edge: triangles that cross its border are split until they are that small
 ALMOST = 0.05  # of a step: objects may stand out of the real scene that far, less than the coarse volume's margin
 
 
@@ -69,3 +70,43 @@ def volume_frame(scene: Scene, volume_scale: float) -> VolumeFrame:
         np.where(low < real[0] - slack, np.minimum(inner[0], outer[0]), inner[0]),
         np.where(high > real[1] + slack, np.maximum(inner[1], outer[1]), inner[1]),
     )
+
+
+def share_beyond(scene: Scene, center: np.ndarray, half: float) -> float:
+    """How much of the sphere of directions around ``center`` the real surfaces outside of a cube fill.
+
+    Occlusion is not looked at, so the share is an upper bound. Triangles that lie outside count by their exact solid
+    angle; those that cross the cube's border are split until they are small beside it, and then count by half.
+
+    Args:
+        center: The cube's middle, world metres. half: Half its edge, metres.
+    """
+    total = 0.0
+    for mesh in scene.meshes:
+        corners = mesh.points[mesh.triangles] - center if mesh.role == Role.REAL else np.zeros((0, 3, 3))
+        while len(corners):
+            low, high = corners.min(1), corners.max(1)
+            apart = np.any((low > half) | (high < -half), 1)
+            total += _solid_angle(corners[apart])
+            crossing = ~apart & np.any((low < -half) | (high > half), 1)
+            small = np.max(high - low, 1) < SPLIT_TO * half
+            total += 0.5 * _solid_angle(corners[crossing & small])
+            corners = _quarters(corners[crossing & ~small])
+    return total / (4.0 * math.pi)
+
+
+def _solid_angle(corners: np.ndarray) -> float:
+    """Sum over triangles ``[t, 3, 3]`` seen from the origin (Van Oosterom and Strackee 1983)."""
+    a, b, c = (corners[:, k] for k in range(3))
+    la, lb, lc = (np.linalg.norm(x, axis=-1) for x in (a, b, c))
+    volume = np.abs(np.einsum("ij,ij->i", a, np.cross(b, c)))
+    ab, ac, bc = (np.einsum("ij,ij->i", x, y) for x, y in ((a, b), (a, c), (b, c)))
+    return float(2.0 * np.arctan2(volume, la * lb * lc + ab * lc + ac * lb + bc * la).sum())
+
+
+def _quarters(corners: np.ndarray) -> np.ndarray:
+    """Each triangle split into four at the middles of its edges."""
+    a, b, c = (corners[:, k] for k in range(3))
+    ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+    parts = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+    return np.concatenate([np.stack(part, 1) for part in parts])

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from warp_dvct.frame import VolumeFrame, volume_frame
+from warp_dvct.frame import VolumeFrame, share_beyond, volume_frame
 from warp_dvct.passes.voxels import Box, level_bricks
 from warp_dvct.scene import Light, LightKind, LightRole, Role, Scene
 from warp_dvct.settings import Settings
 
 COARSE_MARGIN = 1.02  # the coarse volume is this much larger than what it holds, so that no wall lies on its border
+MOST_BEYOND = 0.05  # share of the directions around the objects that may meet surfaces left out of the volumes
 MAP_BYTES = 80  # of a texel of an RSM pair
 RECORD_BYTES = 12 * 16
 POINT_BYTES = 120
@@ -120,7 +121,7 @@ def make_plan(
     added = any(light.role == LightRole.ADDED for light in scene.lights)
     frame = volume_frame(scene, settings.volume_scale)
     origin, scale = frame.origin, 1.0 / frame.edge
-    coarse = _coarse_box(frame, settings)
+    coarse = _coarse_box(scene, frame, settings)
     reach = float(np.linalg.norm(np.max(np.abs(np.stack([frame.low, frame.high]) - 0.5), 0)))
     fine = Box((0.0, 0.0, 0.0), 1.0, settings.volume_resolution)
     maps = tuple(_plan_map(i, x, origin, scale, fine, coarse, synthetic, settings) for i, x in enumerate(scene.lights))
@@ -151,12 +152,21 @@ def make_plan(
     )
 
 
-def _coarse_box(frame: VolumeFrame, settings: Settings) -> Box | None:
-    """The cube around the scene, cut to ``volume.reach``; None where the fine volume holds everything."""
+def _coarse_box(scene: Scene, frame: VolumeFrame, settings: Settings) -> Box | None:
+    """The cube around the scene, cut to ``volume.reach``; None where the fine volume holds everything.
+
+    What is left out reflects nothing. Of an open ground that is a line at the horizon; of the room around a small
+    object it would be all its walls: as long as too much is left out, the reach is doubled.
+    """
     low, high = frame.low, frame.high
     if settings.volume_coarse == 0 or (np.all(low >= 0.0) and np.all(high <= 1.0)):
         return None
     half = 0.5 * settings.volume_reach
+    middle = frame.origin + 0.5 * frame.edge
+    while (np.any(low < 0.5 - half) or np.any(high > 0.5 + half)) and (
+        share_beyond(scene, middle, half * frame.edge) > MOST_BEYOND
+    ):
+        half *= 2.0
     low, high = np.maximum(low, 0.5 - half), np.minimum(high, 0.5 + half)
     edge = COARSE_MARGIN * max(float(np.max(high - low)), 1.0)
     corner = 0.5 * (low + high) - 0.5 * edge
