@@ -178,6 +178,23 @@ def read_plate(path: str | Path, width: int | None = None, height: int | None = 
     return pixels if is_float else srgb_to_linear(pixels)
 
 
+def is_display_referred(path: str | Path) -> bool:
+    """Whether a photograph holds codes of a display: integers, which :func:`read_plate` decodes from sRGB.
+
+    Raises:
+        FileError: Missing, or no image.
+    """
+    import OpenImageIO as oiio
+
+    image = oiio.ImageInput.open(str(path))
+    if image is None:
+        raise FileError(f"plate '{path}' cannot be read: {oiio.geterror()}; is it an image?")
+    try:
+        return image.spec().format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+    finally:
+        image.close()
+
+
 def _rgb(image) -> np.ndarray:
     """Colour channels of an OpenImageIO buffer, float32 ``[h, w, 3]``; grey is repeated."""
     spec = image.spec()

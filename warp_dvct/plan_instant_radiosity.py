@@ -90,6 +90,15 @@ def plan_passes(
             lit and glossy,
             "by rays" if lit and glossy else "no material has a specular lobe smoother than glossy.roughness",
         ),
-        PassPlan("before", not has_plate, "no plate: the real scene is one" if not has_plate else "a plate is given"),
+        _before(settings, has_plate),
         PassPlan("composite", True, "layers and the finished picture", pixels * 100),
     )
+
+
+def _before(settings: Settings, has_plate: bool) -> PassPlan:
+    if not has_plate:
+        return PassPlan("before", True, "no plate: the real scene is one")
+    if settings.difference == "tonemapped":
+        return PassPlan("before", True, "for the difference of tone-mapped solutions")
+    also = "; rendered all the same where its file holds a display's codes" if settings.difference == "auto" else ""
+    return PassPlan("before", False, "a plate is given" + also)

@@ -125,11 +125,13 @@ class Relighter:
         """What the next frame will do."""
         return self._current_plan
 
-    def render(self, plate: np.ndarray | None = None, *, progress: Progress | None = None) -> Layers:
+    def render(self, plate: np.ndarray | None = None, *, ldr: bool = False, progress: Progress | None = None) -> Layers:
         """Render the current frame.
 
         Args:
             plate: The photograph, linear float32 ``[height, width, 3]``; without one the rendered 'before' is it.
+            ldr: The plate was decoded from a display's codes (``image.is_display_referred``): with ``difference=auto``
+                instant radiosity then adds the difference of tone-mapped solutions.
             progress: Called with the pass's name and the share of the frame that is done.
         """
         if plate is not None and plate.shape != (self.height, self.width, 3):
@@ -145,7 +147,7 @@ class Relighter:
         if self.method == "path-trace":
             radiance = self._path_trace(report)
         elif self.method == "instant-radiosity":
-            radiance = self._instant_radiosity(plate, report)
+            radiance = self._instant_radiosity(plate, ldr, report)
         else:
             radiance = self._delta_cones(plate is None, report)
         report("composite", 0.95)
@@ -227,14 +229,16 @@ class Relighter:
             launcher, scene, device_scene, light_field, plan, with_before=with_before, kept=self._kept
         )
 
-    def _instant_radiosity(self, plate: np.ndarray | None, report: Progress) -> Radiance:
+    def _instant_radiosity(self, plate: np.ndarray | None, ldr: bool, report: Progress) -> Radiance:
         report("virtual point lights", 0.0)
         launcher, scene, plan = self._launcher, self.scene, self.plan
         device_scene, shot = self._lit(
             instant_radiosity.Shot, lambda uploaded: instant_radiosity.Shot(launcher, scene, uploaded, plan)
         )
         report("shading", 0.3)
-        tonemapped = plate is not None and plan.settings.difference == "tonemapped" and plan.changes
+        difference = plan.settings.difference
+        wanted = difference == "tonemapped" or (difference == "auto" and ldr)
+        tonemapped = plate is not None and wanted and plan.changes
         radiance = shot.render(launcher, scene, device_scene, plan, with_before=plate is None or tonemapped)
         self._method_notices = shot.notices
         return tonemap_difference(launcher, radiance, plate) if plate is not None and tonemapped else radiance
@@ -267,12 +271,13 @@ def _content_keys(scene: Scene, plan: Plan) -> tuple[str, str]:
     return real, content_key(real, meshes[Role.SYNTHETIC], clouds[Role.SYNTHETIC], scene.lights, *rest)
 
 
-def relight(stage: Any, *, plate: np.ndarray | None = None, **options: Any) -> Layers:
+def relight(stage: Any, *, plate: np.ndarray | None = None, ldr: bool = False, **options: Any) -> Layers:
     """Insert a stage's synthetic objects into its real scene and return the finished layers.
 
     Args:
         stage: Path of a USD stage, an open ``Usd.Stage``, or a ``Scene``.
         plate: The photograph, linear float32 ``[height, width, 3]``; by default the rendered real scene.
+        ldr: As for :meth:`Relighter.render`.
         options: As for :class:`Relighter`.
     """
-    return Relighter(stage, **options).render(plate)
+    return Relighter(stage, **options).render(plate, ldr=ldr)

@@ -79,9 +79,9 @@ class Settings:
         "double", "maps of real and synthetic surfaces apart, or the single one of 2010", choices=("double", "single")
     )
     difference: str = _knob(
-        "plain",
-        "instant-radiosity: linear, or of the two tone-mapped solutions as for LDR plates",
-        choices=("plain", "tonemapped"),
+        "auto",
+        "instant-radiosity: linear, or of the two tone-mapped solutions; auto: that where the plate's file is LDR",
+        choices=("auto", "plain", "tonemapped"),
     )
     vpls_count: int = _knob(256, "virtual point lights of the first bounce", low=1, high=2**17)
     vpls_further: int = _knob(128, "virtual point lights of each further bounce", low=1, high=2**17)

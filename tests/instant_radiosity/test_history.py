@@ -41,7 +41,7 @@ def pushed(scene, meters):
 
 
 def object_moved(scene):
-    meshes = tuple(replace(m, points=m.points + [0.2, 0, 0.1]) if m.role else m for m in scene.meshes)
+    meshes = tuple(replace(m, points=m.points + np.array([0.2, 0, 0.1])) if m.role else m for m in scene.meshes)
     return replace(scene, meshes=meshes)
 
 
@@ -57,7 +57,7 @@ def lamp_dimmed(scene):
 def real_wall_moved(scene):
     meshes = list(scene.meshes)
     index = next(i for i, m in enumerate(meshes) if m.role == Role.REAL)
-    meshes[index] = replace(meshes[index], points=meshes[index].points + [0, 0, -0.05])
+    meshes[index] = replace(meshes[index], points=meshes[index].points + np.array([0, 0, -0.05]))
     return replace(scene, meshes=tuple(meshes))
 
 

@@ -5,10 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import OpenEXR
+import OpenImageIO as oiio
 import pytest
 import warp as wp
+from click.testing import CliRunner
 
 from warp_dvct import usd_scenes
+from warp_dvct.cli import cli
+from warp_dvct.errors import FileError
+from warp_dvct.image import is_display_referred, read_plate, write_png, write_radiance
 from warp_dvct.layers import Radiance
 from warp_dvct.metrics import to_display
 from warp_dvct.passes.difference import tonemap_difference
@@ -89,3 +95,39 @@ def test_tone_mapped_composite_is_near_the_plain_one_where_the_plate_is_the_mode
 
 def radiance_of_nothing():
     return Radiance(1, 1, *[None] * 8)
+
+
+def relit(folder, plate, name, *settings):
+    """The finished picture that the command makes on a plate."""
+    out = folder / f"{name}.exr"
+    arguments = ["relight", usd_scenes.path("room_spot"), out, "--method", "instant-radiosity", "--plate", plate]
+    for pair in (*(f"{k}={v}" for k, v in SMALL.items()), *settings):
+        arguments += ["--set", pair]
+    result = CliRunner().invoke(cli, [str(a) for a in arguments])
+    assert result.exit_code == 0, result.output
+    with OpenEXR.File(str(out)) as file:
+        return np.array(file.channels()["comp"].pixels)
+
+
+def test_a_plate_of_display_codes_gets_the_tone_mapped_difference_by_itself(tmp_path):
+    """The same light in a PNG and in an EXR: the file decides, and the setting overrides it."""
+    codes = np.random.default_rng(0).integers(40, 200, (27, 48, 3)).astype(np.uint8)
+    write_png(tmp_path / "plate.png", codes)
+    write_radiance(tmp_path / "plate.exr", read_plate(tmp_path / "plate.png"))
+    auto = {kind: relit(tmp_path, tmp_path / f"plate.{kind}", kind) for kind in ("png", "exr")}
+    assert np.abs(auto["png"] - auto["exr"]).max() > 0.01
+    for kind, other, difference in (("png", "exr", "plain"), ("exr", "png", "tonemapped")):
+        forced = relit(tmp_path, tmp_path / f"plate.{kind}", f"{kind}-{difference}", f"difference={difference}")
+        np.testing.assert_array_equal(forced, auto[other])
+
+
+def test_integers_are_display_codes_and_floats_are_not(tmp_path):
+    image = np.full((4, 4, 3), 0.5, np.float32)
+    for name, kind, expected in (
+        ("a.png", "uint8", True), ("b.png", "uint16", True), ("c.jpg", "uint8", True), ("d.tif", "uint16", True),
+        ("e.tif", "float", False), ("f.exr", "half", False), ("g.hdr", "float", False),
+    ):  # fmt: skip
+        oiio.ImageBuf(image).write(str(tmp_path / name), kind)
+        assert is_display_referred(tmp_path / name) == expected
+    with pytest.raises(FileError, match="none.png"):
+        is_display_referred(tmp_path / "none.png")

@@ -18,7 +18,7 @@ from warp_dvct.cli.options import stage_options
 from warp_dvct.cli.progress import Progress
 from warp_dvct.cli.quiet import start_warp
 from warp_dvct.errors import FileError
-from warp_dvct.image import check_writable, read_plate, write_exr, write_png, write_text
+from warp_dvct.image import check_writable, is_display_referred, read_plate, write_exr, write_png, write_text
 
 if TYPE_CHECKING:
     from warp_dvct.launch import Launcher
@@ -194,9 +194,9 @@ class Run:
         from warp_dvct.passes.tonemap import tonemap
 
         start = time.perf_counter()
-        plate = _plate(relighter, job)
+        plate, ldr = _plate(relighter, job)
         with Progress(os.path.basename(job.exr)) as progress:
-            layers = relighter.render(plate, progress=progress.update)
+            layers = relighter.render(plate, ldr=ldr, progress=progress.update)
         self._warn(layers, job)
         frame = {} if job.time is None else {"frame": f"{job.time:g}"}
         write_png(job.png, tonemap(preview, layers.comp, exposure=self.exposure, curve=self.curve))
@@ -243,15 +243,15 @@ class Run:
         return result
 
 
-def _plate(relighter: Relighter, job: _Job) -> np.ndarray | None:
-    """The frame's photograph: the one that was named, or the stage's own.
+def _plate(relighter: Relighter, job: _Job) -> tuple[np.ndarray | None, bool]:
+    """The frame's photograph, the one that was named or the stage's own, and whether it holds codes of a display.
 
     Raises:
         FileError: It is not of the picture's size, or the camera has another aspect.
     """
     name = job.plate or relighter.scene.plate
     if name is None:
-        return None
+        return None, False
     plate = read_plate(name, relighter.width, relighter.height)
     rows = relighter.width / relighter.scene.camera.aspect
     if abs(rows - relighter.height) > 1.0:
@@ -260,4 +260,4 @@ def _plate(relighter: Relighter, job: _Job) -> np.ndarray | None:
             f" {relighter.scene.camera.path} sees {relighter.width} x {rows:.0f}; a plate is not resampled: give the"
             " camera the photograph's apertures"
         )
-    return plate
+    return plate, is_display_referred(name)
