@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_dvct.errors import StageError
-from warp_dvct.scene import Light, Mesh, Notice, PointCloud, Scene
+from warp_dvct.scene import Camera, Light, Mesh, Notice, PointCloud, Scene
 from warp_dvct.usd.camera import choose_camera, read_camera, read_plate
 from warp_dvct.usd.collect import Collection, Collector, Placed
 from warp_dvct.usd.context import Context, shared_path
@@ -41,6 +41,7 @@ def read_stage(
     render_pass: str | None = None,
     allow_empty_roles: bool = False,
     images: ImageCache | None = None,
+    view: Camera | None = None,
 ) -> Scene:
     """Read a stage.
 
@@ -56,6 +57,7 @@ def read_stage(
         allow_empty_roles: Accept a stage that defines nothing real or nothing synthetic. Prims that are defined but
             invisible at this time are accepted always.
         images: Keeps image files over several calls.
+        view: Take this camera, and the plate that is given; then the stage needs no camera.
     Returns:
         The scene in metres, y up; its ``notices`` list what was met and is not modelled.
     Raises:
@@ -72,11 +74,14 @@ def read_stage(
         note_composition_errors(stage, ctx.notices)
         broken = ctx.notices.all()
         try:
-            eye = choose_camera(ctx, camera)
+            eye = None if view is not None else choose_camera(ctx, camera)
             found = Collector(ctx, Roles(ctx, real, synthetic, render_pass), tuple(purposes)).collect()
             if not allow_empty_roles:
                 require_roles(stage, found.defined)
-            scene = _assemble(ctx, eye, found, plate, images or ImageCache())
+            if eye is not None:
+                view, plate = read_camera(eye, ctx), read_plate(eye, ctx, plate)
+            assert view is not None
+            scene = _assemble(ctx, view, plate and os.fspath(plate), found, images or ImageCache())
         except StageError as error:
             # What is missing is often in the file that did not load.
             if not broken:
@@ -87,9 +92,7 @@ def read_stage(
     return scene
 
 
-def _assemble(
-    ctx: Context, eye: Usd.Prim, found: Collection, plate: str | os.PathLike | None, images: ImageCache
-) -> Scene:
+def _assemble(ctx: Context, camera: Camera, plate: str | None, found: Collection, images: ImageCache) -> Scene:
     """Read everything that the walk found."""
     if not found.lights_defined:
         raise StageError(f"{name_of(ctx.stage)} has no light; add a UsdLux light")
@@ -105,8 +108,8 @@ def _assemble(
         materials=tuple(materials.materials),
         textures=tuple(materials.textures),
         lights=tuple(lights),
-        camera=read_camera(eye, ctx),
-        plate=read_plate(eye, ctx, plate),
+        camera=camera,
+        plate=plate,
         notices=ctx.notices.all(),
         point_clouds=tuple(clouds),
     )
