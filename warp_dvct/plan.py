@@ -242,8 +242,9 @@ def _is_glossy(scene: Scene, settings: Settings) -> bool:
     return False
 
 
-def _volume_bytes(scene: Scene, box: Box, scale: float, origin: np.ndarray) -> int:
-    """About what a lit volume keeps: records for the surface inside, and the bricks around them."""
+def surface_area(scene: Scene, box: Box, scale: float, origin: np.ndarray) -> float:
+    """About the surface inside of a volume, in volume space; a triangle that crosses the border counts up to twice the
+    area of a side."""
     area = 0.0
     for mesh in scene.meshes:
         # Coordinates apart ([3, t]): three times as fast as [t, 3], and this runs for every frame.
@@ -258,7 +259,12 @@ def _volume_bytes(scene: Scene, box: Box, scale: float, origin: np.ndarray) -> i
         crossing = ~inside & np.all(low <= box.edge, 0) & np.all(high >= 0, 0)
         area += float(size[inside].sum())
         area += min(float(size[crossing].sum()), 2.0 * box.edge**2 * int(crossing.sum()))
-    records = 1.5 * area / box.voxel**2 * 4.0 / 3.0
+    return area
+
+
+def _volume_bytes(scene: Scene, box: Box, scale: float, origin: np.ndarray) -> int:
+    """About what a lit volume keeps: records for the surface inside, and the bricks around them."""
+    records = 1.5 * surface_area(scene, box, scale, origin) / box.voxel**2 * 4.0 / 3.0
     bricks = records / 64.0
     return int(records * RECORD_BYTES + bricks * 2048 + 4 * sum(level_bricks(box.n, k) ** 3 for k in range(1)))
 
