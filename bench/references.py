@@ -24,6 +24,7 @@ from warp_dvct.methods.path_tracing import PathTracer
 from warp_dvct.metrics import flip_ldr
 from warp_dvct.scene import Material, Role, Scene
 
+UNHASHED_IF_EMPTY = {"point_clouds"}  # a scene without them has the key that it always had
 UNHASHED = {"name", "path", "notices", "plate"}  # labels; they do not change the picture
 TRACERS = ("warp_dvct.methods.path_tracing", "warp_dvct.device_scene")
 TRACED_WITH = ("warp_dvct.kernels.", "warp_dvct.methods.", "warp_dvct.passes.")
@@ -234,7 +235,8 @@ def _flatten(value: Any) -> Iterator[bytes]:
     elif is_dataclass(value):
         yield type(value).__name__.encode()
         for item in fields(value):
-            if item.name not in UNHASHED:
+            empty = item.name in UNHASHED_IF_EMPTY and not getattr(value, item.name)
+            if item.name not in UNHASHED and not empty:
                 yield item.name.encode()
                 yield from _flatten(getattr(value, item.name))
     elif isinstance(value, (tuple, list)):
