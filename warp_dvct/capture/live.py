@@ -1,0 +1,185 @@
+"""Relighting straight from depth images, frame by frame: no mesh of the real scene is needed.
+
+Each frame is filtered with what earlier ones saw (:mod:`warp_dvct.passes.depth_filter`); the result, as a triangle
+grid, is the real scene: what G-buffers, RSMs, voxels and the points of imperfect shadow maps are made of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warp_dvct.capture.grid import Grid, GridLimits, depth_grid, grid_mesh
+from warp_dvct.capture.intrinsics import Intrinsics
+from warp_dvct.capture.registration import sample, undistorted_depth
+from warp_dvct.capture.stage import Capture, open_capture
+from warp_dvct.errors import FileError, OptionError, StageError
+from warp_dvct.image import srgb_to_linear
+from warp_dvct.launch import Launcher
+from warp_dvct.passes.depth_filter import DepthFilter, FilteredDepth, FilterOptions
+from warp_dvct.scene import Camera, Material, Role, Scene
+
+if TYPE_CHECKING:
+    from pxr import Usd
+
+ALBEDO = (0.02, 0.95)  # what surfaces reflect, at least and at most
+GREY = 0.5  # albedo where no photograph shows a surface
+SRGB = srgb_to_linear(np.arange(256) / 255.0)
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """How live depth becomes the real scene.
+
+    Attributes:
+        stride: Pixels of the depth image between vertices.
+        filter: Of the depth.
+    """
+
+    stride: int = 2
+    filter: FilterOptions = field(default_factory=FilterOptions)
+
+    def __post_init__(self) -> None:
+        if self.stride < 1:
+            raise OptionError(f"a stride of {self.stride}: give at least 1 pixel between vertices")
+
+
+class LiveSource:
+    """Makes the scene of each frame: the synthetic objects and lights of a stage in a capture's real scene.
+
+    A frame's scene does not depend on where a shot begins: all earlier frames with a known pose are filtered too.
+
+    Args:
+        stage: With synthetic objects and lights, in the capture's world; its real prims are left out, and its camera.
+        capture: The capture's stage.
+        options: How depth becomes surfaces.
+        launcher: Device.
+        reading: Further keywords of ``read_stage``: real, synthetic, strict, purposes.
+    Raises:
+        StageError, FileError: One of both cannot be read.
+    """
+
+    def __init__(
+        self,
+        stage: str | Path | Usd.Stage,
+        capture: str | Path | Capture,
+        *,
+        launcher: Launcher,
+        options: LiveOptions | None = None,
+        **reading: Any,
+    ) -> None:
+        self.capture = capture if isinstance(capture, Capture) else open_capture(capture)
+        self._stage, self._reading = stage, reading
+        self._launcher, self._options = launcher, options or LiveOptions()
+        depth = self.capture.rig.depth
+        lens = (depth.fx, depth.fy, depth.cx, depth.cy)
+        self._filter = DepthFilter(launcher, lens, depth.size, self._options.filter)
+        self._next = 0
+        self._filtered: FilteredDepth | None = None
+        self.skipped: list[str] = []
+
+    def index(self, time: float | None) -> int:
+        """The frame at a time code; the first one with a known pose for None.
+
+        Raises:
+            StageError: The capture has no frame at that time.
+        """
+        capture = self.capture
+        if time is None:
+            return next((k for k in capture if capture.pose(k) is not None), 0)
+        if time not in capture.times:
+            raise StageError(
+                f"'{capture.path}' has no frame {time:g}; its frames are {capture.times[0]:g} to {capture.times[-1]:g}"
+            )
+        return capture.times.index(time)
+
+    def scene(self, time: float | None = None, progress: Progress = lambda done, total: None) -> Scene:
+        """The scene of a frame, with its photograph as the plate.
+
+        Raises:
+            StageError: There is no such frame, or its pose is not known.
+            FileError: Its images cannot be read; earlier frames that cannot are left out and listed in ``skipped``.
+        """
+        from warp_dvct.usd.read import read_stage
+
+        index = self.index(time)
+        pose = self.capture.pose(index)
+        if pose is None:
+            raise StageError(
+                f"{self.capture.name(index)} has no known pose; find the poses with `warp-dvct reconstruct --track`"
+            )
+        filtered = self._advance(index, progress)
+        color = self.capture.color(index)
+        rig = self.capture.rig
+        camera = _view(self.capture, index, pose, has_color=color is not None)
+        scene = read_stage(
+            self._stage,
+            time=time,
+            view=camera,
+            plate=self.capture.color_file(index),
+            allow_empty_roles=True,
+            **self._reading,
+        )
+        kept = tuple(mesh for mesh in scene.meshes if mesh.role == Role.SYNTHETIC)
+        clouds = tuple(cloud for cloud in scene.point_clouds if cloud.role == Role.SYNTHETIC)
+        grid = self._grid(filtered)
+        albedo = np.full((len(grid.points), 3), GREY) if color is None else _albedo(grid, color, rig)
+        mesh = grid_mesh(grid, pose, len(scene.materials), albedo, self.capture.depth_path)
+        lambert = Material(base_color=(1.0, 1.0, 1.0), roughness=1.0, ior=1.0, name=f"{self.capture.depth_path} (live)")
+        return replace(scene, meshes=(mesh, *kept), materials=(*scene.materials, lambert), point_clouds=clouds)
+
+    def filtered(self, time: float | None = None) -> FilteredDepth:
+        """The filtered depth of a frame, in the depth camera."""
+        return self._advance(self.index(time))
+
+    def _advance(self, index: int, progress: Progress = lambda done, total: None) -> FilteredDepth:
+        """Filter frames up to ``index``; from the first one again where it lies behind."""
+        if self._filtered is None or index < self._next - 1:
+            self._filter.reset()
+            self._next = 0
+        first = self._next
+        while self._next <= index:
+            number, self._next = self._next, self._next + 1
+            pose = self.capture.pose(number)
+            if pose is None:
+                continue
+            try:
+                depth, _ = undistorted_depth(self.capture.depth(number), self.capture.rig.depth)
+            except FileError as error:
+                if number == index:
+                    raise
+                if str(error) not in self.skipped:
+                    self.skipped.append(str(error))
+                continue
+            self._filtered = self._filter.update(depth, pose)
+            progress(number + 1 - first, index + 1 - first)
+        assert self._filtered is not None
+        return self._filtered
+
+    def _grid(self, filtered: FilteredDepth) -> Grid:
+        options = self._options.filter
+        limits = GridLimits(options.edge * options.noise, options.edge_share)
+        inverse = filtered.inverse.numpy().reshape(filtered.height, filtered.width)
+        return depth_grid(inverse, filtered.normals(), self.capture.rig.depth, limits, self._options.stride)
+
+
+def _view(capture: Capture, index: int, pose: np.ndarray, *, has_color: bool) -> Camera:
+    """The camera of the photograph, or the depth camera where there is none."""
+    rig = capture.rig
+    lens: Intrinsics = rig.color if has_color and rig.color is not None else rig.depth
+    path = capture.color_path if has_color and capture.color_path else capture.depth_path
+    return lens.scene_camera(pose @ np.linalg.inv(rig.depth_to_color) if has_color else pose, path)
+
+
+def _albedo(grid: Grid, color: np.ndarray, rig: Any) -> np.ndarray:
+    """The photograph's linear colours at the vertices: the paper's albedo (Knecht et al. 2012, section 4)."""
+    turn, shift = rig.depth_to_color[:3, :3], rig.depth_to_color[:3, 3]
+    uv = rig.color.project(grid.points @ turn.T + shift)
+    values, inside = sample(SRGB[color], uv)
+    return np.where(inside[:, None], np.clip(values, *ALBEDO), GREY)
