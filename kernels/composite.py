@@ -5,6 +5,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 HALF_MAX = wp.constant(65504.0)
+FLOAT_LARGE = wp.constant(1.0e38)
 # Below the smallest normal half number a ratio to the plate is rounding noise: there the shadow is left at 1.
 HALF_TINY = wp.constant(6.103515625e-05)
 
@@ -21,6 +22,14 @@ def storable(value: float) -> float:
     if wp.isnan(value):
         return 0.0
     return wp.clamp(value, -HALF_MAX, HALF_MAX)
+
+
+@wp.func
+def finite(value: float) -> float:
+    """``value`` inside of what single precision computes with; NaN becomes 0."""
+    if wp.isnan(value):
+        return 0.0
+    return wp.clamp(value, -FLOAT_LARGE, FLOAT_LARGE)
 
 
 @wp.func
@@ -78,8 +87,9 @@ def _composite_pixels(
             # From the sum over the pixel's real part to the mean over that part.
             mean = raw_delta[c] / (1.0 - covered)
         change = storable(mean)
-        # The ratio is taken before rounding, so that a full shadow is exactly black.
-        ratio = round_half(shadow_ratio(storable(raw_plate[c]), change))
+        # The ratio is taken before rounding, so that a full shadow is exactly black, and before clamping, so that a
+        # slight shadow on something too bright to store is not.
+        ratio = round_half(shadow_ratio(finite(raw_plate[c]), finite(mean)))
         base = round_half(storable(raw_plate[c]))
         light = round_half(wp.max(change, 0.0))
         own = round_half(storable(raw_synthetic[c]))
