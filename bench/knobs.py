@@ -107,7 +107,7 @@ def choose_trials(
         bounces: Of every point but presets, and but those whose knob it is.
         glossy: Whether the stage has glossy surfaces.
     Returns:
-        The points, each once, and what was left out and why.
+        The points, each once in its group, and what was left out and why.
     Raises:
         OptionError: An unknown method or knob, a value outside its range, or nothing left to measure.
     """
@@ -177,5 +177,5 @@ def _parse(chosen: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def _identity(trial: Trial) -> tuple:
-    """Points that would render the same picture for the same cost are one."""
-    return trial.method, make_settings(trial.quality, trial.settings)
+    """Points of a group that would render the same picture for the same cost are one."""
+    return trial.method, trial.group, make_settings(trial.quality, trial.settings)

@@ -56,6 +56,10 @@ def write_page(
 
 
 def _stage(name: str, rows: Sequence[Mapping[str, Any]], out: Path) -> dict[str, Any]:
+    every = rows
+    rows = list({row["key"]: row for row in reversed(rows)}.values())[
+        ::-1
+    ]  # a picture may be a point of several sweeps
     first, methods = rows[0], list(dict.fromkeys(r["method"] for r in rows))
     on_front: set[str] = set()
     for method in methods:
@@ -89,7 +93,7 @@ def _stage(name: str, rows: Sequence[Mapping[str, Any]], out: Path) -> dict[str,
         "points": points,
         "pictures": {key: value for key, value in pictures.items() if value},
         "shown": [option for option in options if pictures.get(option[0])],
-        "words": words(rows),
+        "words": words(every),
     }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher
 from warp_dvct.metrics import affected_mask, flip_ldr, import_flip, rel_mse, rmse, smooth_delta
 from warp_dvct.scene import Role, Scene
+from warp_dvct.settings import make_settings
 
 KIND = "tradeoff"
 ROWS = "rows.jsonl"
@@ -138,16 +139,19 @@ class Bench:
         warm: set[str] = set()
         rows = []
         for trial in trials:
-            rows.append(self._point(self._key(trial.method, trial.quality, trial.settings), trial, warm))
+            settings = asdict(make_settings(trial.quality, trial.settings))
+            row = self._point(self._key(trial.method, settings), trial, warm)
+            # One picture may be a point of several sweeps.
+            rows.append({**row, "group": trial.group, "value": trial.value, "name": trial.name})
         if options.peers and not options.knobs:
             rows += self._peers()
         save_truth(options.out, Path(self.stage).stem, self.truth)
         return rows
 
-    def _key(self, method: str, quality: str, settings: Mapping[str, str]) -> str:
+    def _key(self, method: str, settings: Mapping[str, Any]) -> str:
         """What a point depends on besides the machine and the methods' sources, which the row names."""
         o = self.options
-        content = [self.store.key(o.bounces), method, quality, dict(sorted(settings.items())), o.flicker, o.device]
+        content = [self.store.key(o.bounces), method, dict(sorted(settings.items())), o.flicker, o.device]
         return hashlib.sha256(json.dumps([*content, o.threads]).encode()).hexdigest()[:24]
 
     def _point(self, key: str, trial: Trial, warm: set[str]) -> dict[str, Any]:
@@ -236,7 +240,7 @@ class Bench:
         from warp_dvct.bench import peers
 
         names = [f"Mitsuba {n} spp{end}" for end in ("", ", OIDN") for n in PEER_SAMPLES]
-        keys = {name: self._key(name, "", {"variant": "mitsuba"}) for name in names}
+        keys = {name: self._key(name, {}) for name in names}
         rows = []
         for name in names:
             if keys[name] in self.known:

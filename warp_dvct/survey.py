@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
+from warp_dvct.kernels import survey as kernels
 from warp_dvct.launch import Launcher
 from warp_dvct.methods import delta_cone_tracing
 from warp_dvct.metrics import affected_mask, smooth_delta
@@ -23,6 +25,7 @@ from warp_dvct.scene import Light, LightKind, Role, Scene
 from warp_dvct.settings import Settings, make_settings
 
 WIDTH = 80
+MET_RAYS = 4
 COARSE = {
     "bounces": 2,
     "antialias": 0,
@@ -60,6 +63,7 @@ class Survey:
         maps: Per light.
         area_fine, area_coarse: Surface in each volume, over the square of its edge; 0 for no coarse volume.
         real, object: Shares of the pixels whose centre shows real surface, and synthetic.
+        met: Of rays that gather light at what is seen, the share that meets a surface and does not leave the scene.
         outline: Edge pixels of a picture, over its width.
         glossy: Share of the pixels with a lobe that is traced by itself.
         near: Over all lights, shares of pixels whose line to the light passes the synthetic objects.
@@ -79,6 +83,7 @@ class Survey:
     area_coarse: float
     real: float
     object: float
+    met: float
     outline: float
     glossy: float
     near: float
@@ -124,6 +129,7 @@ def survey(scene: Scene, settings: Settings, launcher: Launcher, aspect: float, 
         area_coarse=_area(scene, plan, plan.coarse) if plan.coarse else 0.0,
         real=float(real.mean()),
         object=float((role == int(Role.SYNTHETIC)).mean()),
+        met=_met(launcher, device_scene, buffer),
         outline=(buffer.count - WIDTH * height) / WIDTH,
         glossy=float(glossy.mean()),
         near=_near(scene, plan, buffer, real),
@@ -135,6 +141,14 @@ def survey(scene: Scene, settings: Settings, launcher: Launcher, aspect: float, 
         voxel=1.0 / plan.scale,
         roughness=_smoothest(scene) if plan.glossy else None,
     )
+
+
+def _met(launcher: Launcher, device_scene: DeviceScene, buffer: GBuffer) -> float:
+    count = WIDTH * buffer.height
+    found = launcher.empty(count, wp.int32)
+    launcher.launch(kernels._count_met, count, [buffer.points, device_scene.geometry, MET_RAYS, 0], [found])
+    met = found.numpy()
+    return float(met[met >= 0].mean()) / MET_RAYS if (met >= 0).any() else 0.0
 
 
 def _area(scene: Scene, plan: Plan, box: Any) -> float:

@@ -28,7 +28,7 @@ def test_every_knob_that_matters_is_swept_and_every_value_is_valid():
     for trial in trials:
         make_settings(trial.quality, trial.settings)
     assert {t.method for t in trials} == set(knobs.METHODS)
-    assert len({(t.method, make_settings(t.quality, t.settings)) for t in trials}) == len(trials)
+    assert len({(t.method, t.group, make_settings(t.quality, t.settings)) for t in trials}) == len(trials)
 
 
 def test_values_that_move_together():
@@ -131,6 +131,19 @@ def test_a_sweep_measures_draws_and_resumes(cache, tmp_path):
     assert "changing samples from 32 to 1 costs" in second.output
     content = json.loads((tmp_path / "page/index.html").read_text().split('id="data">')[1].split("</script>")[0])
     assert "--knob samples=1,32" in content["commands"][0]
+
+
+def test_a_picture_that_belongs_to_two_sweeps_is_rendered_once(cache, tmp_path):
+    """The preset is a value of each sweep; the file holds it once."""
+    knobs_ = ("--knob", "vpls.tiles=4,8", "--knob", "ism.size=32,128", "--knob", "ism.points=1024")
+    small = ("--method", "instant-radiosity", "--flicker", "0", "--html", str(tmp_path / "page"))
+    result = run(cache, tmp_path, *knobs_, *small)
+    assert result.exit_code == 0
+    assert len(read_rows(tmp_path / "rows.jsonl")) == 3
+    assert "doubling vpls.tiles from 4 to 8" in result.output or "halving vpls.tiles from 8 to 4" in result.output
+    assert "quartering ism.size from 128 to 32" in result.output
+    content = json.loads((tmp_path / "page/index.html").read_text().split('id="data">')[1].split("</script>")[0])
+    assert len(content["stages"][0]["points"]) == 3
 
 
 def test_every_method_is_measured(cache, tmp_path):
