@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_dvct.kernels.cones import DUAL, OPAQUE, ConeSettings, march_cone
 from warp_dvct.kernels.environment import Environment, environment_radiance
-from warp_dvct.kernels.gbuffer import BACKGROUND, SYNTHETIC, Points, load_surface
+from warp_dvct.kernels.gbuffer import BACKGROUND, SYNTHETIC, UNSEEN, Points, first_sample, load_surface
 from warp_dvct.kernels.geometry import (
     FAR,
     Geometry,
@@ -289,8 +289,9 @@ def _gather_rays(
             known = False
             if kept_out.present != 0:
                 known = kept_out.point[i] == j
+            start = first_sample(rays, points, j)
             for k in range(rays):
-                local = cosine_hemisphere(sobol2(seed, j, k, 11))
+                local = cosine_hemisphere(sobol2(seed, points.pixel[j], start + k, 11))
                 direction = from_frame(local, s.normal)
                 solid_angle = PI / (float(rays) * wp.max(local[2], 0.05))
                 if wp.dot(direction, s.normal_g) > 0.0:
@@ -333,7 +334,7 @@ def _gather_cones(
     if j >= 0:
         if points.role[j] != BACKGROUND:
             s = load_surface(points, j)
-            turn = 2.0 * PI * uniform1(seed, j, 0, 13)
+            turn = 2.0 * PI * uniform1(seed, points.pixel[j], wp.max(points.slot[j], 0), 13)
             for k in range(cones):
                 sine2 = (float(k) + 0.5) / float(cones)
                 phi = 2.399963 * float(k) + turn
@@ -378,7 +379,7 @@ def _shade_indirect(
     """Add diffusely reflected indirect light: after on synthetic points (eq. 8), the change on real ones (eq. 6)."""
     i = first + wp.tid()
     role = points.role[i]
-    if role != BACKGROUND:
+    if role != BACKGROUND and points.slot[i] != UNSEEN:
         s = load_surface(points, i)
         reflectance = diffuse_reflectance(s, points.view[i], alpha_max)
         if role == SYNTHETIC:

@@ -21,6 +21,10 @@ BACKGROUND = wp.constant(-1)
 REAL = wp.constant(0)
 SYNTHETIC = wp.constant(1)
 
+# ``Points.slot`` of a pixel's centre: the pixel's only point, or one that only guides because edge points replace it.
+WHOLE = wp.constant(-1)
+UNSEEN = wp.constant(-2)
+
 # An edge: a neighbour farther off the tangent plane than this many pixel footprints, or turned by more than 18 degrees.
 PLANE_GAP = wp.constant(1.5)
 NORMAL_GAP = wp.constant(0.95)
@@ -28,9 +32,15 @@ NORMAL_GAP = wp.constant(0.95)
 
 @wp.struct
 class Points:
-    """Surfaces to be shaded, structure of arrays; ``role`` is BACKGROUND where there is none."""
+    """Surfaces to be shaded, structure of arrays; ``role`` is BACKGROUND where there is none.
+
+    Random numbers go by ``pixel`` and ``slot``, so that a point keeps its own wherever else the picture has edges, and
+    the points of one pixel draw from one sequence.
+    """
 
     role: wp.array(dtype=wp.int32)
+    pixel: wp.array(dtype=wp.int32)
+    slot: wp.array(dtype=wp.int32)  # which of an edge pixel's points, from 0; or WHOLE, UNSEEN
     triangle: wp.array(dtype=wp.int32)
     position: wp.array(dtype=wp.vec3)
     normal_g: wp.array(dtype=wp.vec3)
@@ -60,6 +70,20 @@ def load_surface(points: Points, i: int) -> Surface:
     s.triangle = points.triangle[i]
     s.front = 1
     return s
+
+
+@wp.func
+def share_of(samples: int, points: Points, i: int, edge_samples: int) -> int:
+    """How many of a pixel's samples a point takes: all, or an edge point's part of them."""
+    if points.slot[i] >= 0:
+        return (samples + edge_samples - 1) / edge_samples
+    return samples
+
+
+@wp.func
+def first_sample(share: int, points: Points, i: int) -> int:
+    """Where a point's samples start in its pixel's sequence."""
+    return wp.max(points.slot[i], 0) * share
 
 
 @wp.func
@@ -120,6 +144,8 @@ def _see_real(
     hit = trace_real(geo, ray.origin, ray.direction, ray.t_max)
     spread = (cam.tan_right - cam.tan_left) / float(width)
     store_hit(geo, mats, hit, ray.origin, ray.direction, spread, i, points_out)
+    points_out.pixel[i] = i
+    points_out.slot[i] = WHOLE
     reach_out[i] = hit.t
 
 
@@ -211,7 +237,12 @@ def _see_edges(
     xi = sobol2(seed, pixel, i % samples, 0)
     px = float(pixel % width) + xi[0]
     py = float(pixel / width) + xi[1]
-    see(geo, mats, cam, px, py, width, height, width * height + i, points_out)
+    at = width * height + i
+    see(geo, mats, cam, px, py, width, height, at, points_out)
+    points_out.pixel[at] = pixel
+    points_out.slot[at] = i % samples
+    if i % samples == 0:
+        points_out.slot[pixel] = UNSEEN
 
 
 @wp.kernel
@@ -242,3 +273,5 @@ def _see_behind(
     hit = trace_real(geo, start, direction, reach)
     hit.t += travelled
     store_hit(geo, mats, hit, cam.origin, direction, spread, i, points_out)
+    points_out.pixel[i] = visible.pixel[j]
+    points_out.slot[i] = visible.slot[j]

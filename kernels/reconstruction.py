@@ -112,7 +112,6 @@ def _smooth(
 def _reconstruct(
     first: int,
     points: Points,
-    pixel_in: wp.array(dtype=wp.int32),
     width: int,
     role: int,
     guide: Guide,
@@ -130,7 +129,7 @@ def _reconstruct(
     i = first + wp.tid()
     missing = int(0)
     if points.role[i] == role:
-        pixel = pixel_in[i]
+        pixel = points.pixel[i]
         px = float(pixel % width) + 0.5
         py = float(pixel / width) + 0.5
         stride = float(guide.stride)
@@ -175,18 +174,6 @@ def _scatter_missing(
     i = first + wp.tid()
     before_out[index_in[i]] = before_in[i]
     after_out[index_in[i]] = after_in[i]
-
-
-@wp.kernel
-def _point_pixels(
-    first: int, edge_pixel_in: wp.array(dtype=wp.int32), pixels: int, samples: int, pixel_out: wp.array(dtype=wp.int32)
-):
-    """The pixel that each shading point belongs to."""
-    i = first + wp.tid()
-    pixel = i
-    if i >= pixels:
-        pixel = edge_pixel_in[(i - pixels) / samples]
-    pixel_out[i] = pixel
 
 
 @wp.kernel

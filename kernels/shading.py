@@ -3,7 +3,15 @@
 import warp as wp
 
 from warp_dvct.kernels.cones import ConeSettings, march_cone
-from warp_dvct.kernels.gbuffer import BACKGROUND, SYNTHETIC, Points, load_surface
+from warp_dvct.kernels.gbuffer import (
+    BACKGROUND,
+    SYNTHETIC,
+    UNSEEN,
+    Points,
+    first_sample,
+    load_surface,
+    share_of,
+)
 from warp_dvct.kernels.geometry import Geometry, occluded_by_real, occluded_by_synthetic
 from warp_dvct.kernels.lights import ADDED, DISK, DISTANT, DOME, RECT, Lights, LightSample, sample_light
 from warp_dvct.kernels.materials import (
@@ -27,9 +35,10 @@ SHADOW_END = wp.constant(0.9999)  # of the way to the light: a surface that the 
 class Direct:
     """Settings of the pass."""
 
-    samples: wp.int32  # per light
+    samples: wp.int32  # per light and pixel
+    edge_samples: wp.int32  # points of an edge pixel, which share its samples out
     probes: wp.int32  # of these, traced before deciding whether the others have to be
-    glossy: wp.int32  # rays of the specular pass per point; light samples share the highlights with them
+    glossy: wp.int32  # rays of the specular pass per pixel; light samples share the highlights with them
     alpha_max: wp.float32  # roughest GGX alpha that the specular pass treats
     with_before: wp.int32  # 1: also the radiance before, on every real point (it becomes the plate)
     seed: wp.int32
@@ -141,16 +150,41 @@ def meets_objects(origin: wp.vec3, direction: wp.vec3, reach: float, direct: Dir
     return wp.length_sq(to_center - direction * along) <= direct.radius * direct.radius
 
 
+@wp.struct
+class Draw:
+    """Which light samples a point takes: numbers ``first`` to ``first + samples`` of its pixel's sequence."""
+
+    pixel: wp.int32
+    first: wp.int32
+    samples: wp.int32
+    probes: wp.int32
+
+
 @wp.func
-def untouched(s: Surface, wo: wp.vec3, i: int, geo: Geometry, lights: Lights, k: int, direct: Direct) -> bool:
+def draw_of(points: Points, i: int, direct: Direct) -> Draw:
+    draw = Draw()
+    draw.pixel = points.pixel[i]
+    draw.samples = share_of(direct.samples, points, i, direct.edge_samples)
+    draw.first = first_sample(draw.samples, points, i)
+    draw.probes = wp.min(direct.probes, draw.samples)
+    return draw
+
+
+@wp.func
+def drawn_light(lights: Lights, k: int, s: Surface, draw: Draw, count: int, direct: Direct) -> LightSample:
+    return sample_light(lights, k, s.position, sobol2(direct.seed, draw.pixel, draw.first + count, 2 * k + 3))
+
+
+@wp.func
+def untouched(s: Surface, wo: wp.vec3, draw: Draw, geo: Geometry, lights: Lights, k: int, direct: Direct) -> bool:
     """Whether the probes of ``light_part`` meet no synthetic object: the light then does not change, to the last bit.
 
     Most real points are such, and for them this leaves out the unshadowed light of every sample.
     """
     lit = bool(False)
     count = int(0)
-    while count < direct.probes:
-        light = sample_light(lights, k, s.position, sobol2(direct.seed, i, count, 2 * k + 3))
+    while count < draw.probes:
+        light = drawn_light(lights, k, s, draw, count, direct)
         if not lit:
             f = reflected(s, wo, light, direct)
             lit = wp.max(f[0], wp.max(f[1], f[2])) > 0.0
@@ -167,8 +201,7 @@ def untouched(s: Surface, wo: wp.vec3, i: int, geo: Geometry, lights: Lights, k:
 
 @wp.func
 def light_part(
-    points: Points,
-    i: int,
+    draw: Draw,
     s: Surface,
     wo: wp.vec3,
     role: int,
@@ -185,7 +218,7 @@ def light_part(
     need_before = int(1)
     if delta_only and direct.with_before == 0:
         need_before = 0
-        if untouched(s, wo, i, geo, lights, k, direct):
+        if untouched(s, wo, draw, geo, lights, k, direct):
             return Part()
     open = wp.vec3(0.0, 0.0, 0.0)
     sum_before = wp.vec3(0.0, 0.0, 0.0)
@@ -193,11 +226,11 @@ def light_part(
     seen_before = float(0.0)
     seen_after = float(0.0)
     traced = int(0)
-    samples = int(direct.samples)
+    samples = int(draw.samples)
     tracing = bool(True)
     count = int(0)
     while count < samples:
-        light = sample_light(lights, k, s.position, sobol2(direct.seed, i, count, 2 * k + 3))
+        light = drawn_light(lights, k, s, draw, count, direct)
         f = reflected(s, wo, light, direct)
         open += f
         if tracing and wp.max(f[0], wp.max(f[1], f[2])) > 0.0:
@@ -217,7 +250,7 @@ def light_part(
         count += 1
         if light.pdf <= 0.0:
             samples = 1  # a light without extent: every sample is this one
-        elif tracing and count == direct.probes and traced > 0:
+        elif tracing and count == draw.probes and traced > 0:
             n = float(traced)
             tracing = (seen_before > 0.0 and seen_before < n) or (seen_after > 0.0 and seen_after < n)
     if not tracing:
@@ -252,10 +285,11 @@ def _shade_direct(
     light_out[i] = wp.vec3(0.0, 0.0, 0.0)
     if direct.with_before != 0:
         before_out[i] = wp.vec3(0.0, 0.0, 0.0)
-    if role == BACKGROUND:
+    if role == BACKGROUND or points.slot[i] == UNSEEN:
         return
     s = load_surface(points, i)
     wo = points.view[i]
+    draw = draw_of(points, i, direct)
     total = wp.vec3(0.0, 0.0, 0.0)
     before = wp.vec3(0.0, 0.0, 0.0)
     for k in range(lights.count):
@@ -263,7 +297,7 @@ def _shade_direct(
             added = lights.role[k] == ADDED
             shadowed = may_shadow(lights, k, s.position, direct)
             if role == SYNTHETIC or added or direct.with_before != 0 or shadowed:
-                part = light_part(points, i, s, wo, role, geo, lights, k, direct, added, shadowed)
+                part = light_part(draw, s, wo, role, geo, lights, k, direct, added, shadowed)
                 total += part.light
                 before += part.before
     light_out[i] = total
@@ -320,18 +354,19 @@ def _shade_direct_cones(
     light_out[i] = wp.vec3(0.0, 0.0, 0.0)
     if direct.with_before != 0:
         before_out[i] = wp.vec3(0.0, 0.0, 0.0)
-    if role == BACKGROUND:
+    if role == BACKGROUND or points.slot[i] == UNSEEN:
         return
     s = load_surface(points, i)
     wo = points.view[i]
+    draw = draw_of(points, i, direct)
     total = wp.vec3(0.0, 0.0, 0.0)
     before = wp.vec3(0.0, 0.0, 0.0)
     for k in range(lights.count):
         if lights.kind[k] != DOME:
             open = wp.vec3(0.0, 0.0, 0.0)
-            for j in range(direct.samples):
-                light = sample_light(lights, k, s.position, sobol2(direct.seed, i, j, 2 * k + 3))
-                open += reflected(s, wo, light, direct) / float(direct.samples)
+            for j in range(draw.samples):
+                light = drawn_light(lights, k, s, draw, j, direct)
+                open += reflected(s, wo, light, direct) / float(draw.samples)
             if wp.max(open[0], wp.max(open[1], open[2])) > 0.0:
                 left = shadow_cone(lights, k, s, fine, coarse, has_coarse, cone)
                 if role == SYNTHETIC or lights.role[k] == ADDED:

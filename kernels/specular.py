@@ -6,7 +6,7 @@ from warp_dvct.kernels.bounce_field import BounceField, bounced_irradiance
 from warp_dvct.kernels.cones import ConeSettings
 from warp_dvct.kernels.environment import environment_radiance
 from warp_dvct.kernels.gather import Incident, World, cone_incident, diffuse_reflectance, ray_incident
-from warp_dvct.kernels.gbuffer import BACKGROUND, Points, load_surface
+from warp_dvct.kernels.gbuffer import BACKGROUND, UNSEEN, Points, first_sample, load_surface, share_of
 from warp_dvct.kernels.geometry import (
     FAR,
     Geometry,
@@ -40,7 +40,8 @@ BLURRED = wp.constant(0.1)
 class Glossy:
     """Settings of the specular pass."""
 
-    rays: wp.int32
+    rays: wp.int32  # per pixel
+    edge_samples: wp.int32  # points of an edge pixel, which share its rays out
     light_samples: wp.int32  # of the direct pass, which shares the highlights
     alpha_max: wp.float32  # roughest lobe that is traced
     again: wp.int32  # 1: what a reflection shows may itself reflect
@@ -228,8 +229,11 @@ def _shade_specular_rays(
     wo = points.view[j]
     before = wp.vec3(0.0, 0.0, 0.0)
     after = wp.vec3(0.0, 0.0, 0.0)
-    for k in range(glossy.rays):
-        direction = reflect_visible(s, wo, sobol2(glossy.seed, j, k, 17))
+    pixel = points.pixel[j]
+    rays = share_of(glossy.rays, points, j, glossy.edge_samples)
+    start = first_sample(rays, points, j)
+    for k in range(start, start + rays):
+        direction = reflect_visible(s, wo, sobol2(glossy.seed, pixel, k, 17))
         density = vndf_pdf(s, wo, direction)
         if wp.dot(direction, s.normal_g) > 0.0 and density > 0.0:
             weight = brdf_cos_specular(s, wo, direction) / density
@@ -239,13 +243,13 @@ def _shade_specular_rays(
                 light = blurred_along(geo, world, lights, origin, direction, density, glossy)
             else:
                 light = reflected_along(
-                    geo, mats, world, bounces, lights, origin, direction, density, glossy, 1 - s.synthetic, j, k
+                    geo, mats, world, bounces, lights, origin, direction, density, glossy, 1 - s.synthetic, pixel, k
                 )
             after += wp.cw_mul(weight, light.after)
             if s.synthetic == 0:
                 before += wp.cw_mul(weight, light.before)
-    after = after / float(glossy.rays)
-    before = before / float(glossy.rays)
+    after = after / float(rays)
+    before = before / float(rays)
     light_out[j] += after - before
     if with_before != 0:
         before_out[j] += before
@@ -290,5 +294,10 @@ def _shade_specular_cones(
 def _mark_glossy(first: int, points: Points, alpha_max: float, flag_out: wp.array(dtype=wp.int32)):
     """1 where a point has a specular lobe that the specular pass treats."""
     i = first + wp.tid()
-    glossy = points.role[i] != BACKGROUND and points.lobe[i][0] > 0.0 and points.lobe[i][1] <= alpha_max
+    glossy = (
+        points.role[i] != BACKGROUND
+        and points.slot[i] != UNSEEN
+        and points.lobe[i][0] > 0.0
+        and points.lobe[i][1] <= alpha_max
+    )
     flag_out[i] = wp.where(glossy, 1, 0)

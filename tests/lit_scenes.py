@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import cones, shading
+from warp_dvct.kernels.gbuffer import WHOLE
 from warp_dvct.kernels.volume import Volume, find_record
 from warp_dvct.launch import Launcher
 from warp_dvct.methods.delta_cone_tracing import _normals, _world
@@ -212,6 +213,8 @@ def points_at(launcher: Launcher, positions, normals, *, role=0, color=(0.5, 0.5
     points.normal = points.normal_g = points.view = launcher.array(np.ascontiguousarray(normals), wp.vec3)
     points.base_color = points.diffuse = launcher.full(count, wp.vec3(*color), wp.vec3)
     points.reach = launcher.full(count, reach, wp.float32)
+    points.pixel = launcher.array(np.arange(count, dtype=np.int32), wp.int32)
+    points.slot = launcher.full(count, WHOLE, wp.int32)
     points.role = launcher.array(np.broadcast_to(np.asarray(role, np.int32), count).copy(), wp.int32)
     return points
 
@@ -249,6 +252,7 @@ def direct_settings(scene: Scene, *, samples: int = 1, probes: int | None = None
     """Settings of the direct pass without a specular pass, with the bounding sphere of the synthetic objects."""
     direct = shading.Direct()
     direct.samples, direct.probes = samples, samples if probes is None else probes
+    direct.edge_samples = 1
     direct.glossy, direct.alpha_max, direct.seed = 0, -1.0, 0
     direct.with_before = int(with_before)
     bounds = scene.bounds(Role.SYNTHETIC)

@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 from warp_dvct.launch import Launcher
-from warp_dvct.passes.gather import Gatherer, gather_all, gather_sparse, merge, point_pixels, shade_indirect
+from warp_dvct.passes.gather import Gatherer, gather_all, gather_sparse, merge, shade_indirect
 from warp_dvct.passes.gbuffer import render_gbuffer
 from warp_dvct.scene import Light, LightKind, LightRole, Role
 
@@ -48,10 +48,7 @@ def seen(launcher, scene, width=75, height=61, samples=4):
 
 
 def sparse(launcher, buffer, gatherer, role=Role.REAL, *, stride=4, radius=2, smoothing=2):
-    pixel = point_pixels(launcher, buffer)
-    before, after = gather_sparse(
-        launcher, buffer, pixel, role, gatherer, stride=stride, radius=radius, smoothing=smoothing
-    )
+    before, after = gather_sparse(launcher, buffer, role, gatherer, stride=stride, radius=radius, smoothing=smoothing)
     return before.numpy()[: buffer.count].astype(float), after.numpy()[: buffer.count].astype(float)
 
 

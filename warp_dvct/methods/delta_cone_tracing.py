@@ -29,7 +29,6 @@ from warp_dvct.passes.gather import (
     gather_sparse,
     keep_rays,
     merge,
-    point_pixels,
     shade_indirect,
 )
 from warp_dvct.passes.gbuffer import GBuffer, render_gbuffer, see_real
@@ -318,6 +317,7 @@ def _shade_direct(
     settings = plan.settings
     direct = shading.Direct()
     direct.samples = settings.shadows_samples
+    direct.edge_samples = max(1, settings.antialias)
     direct.probes = min(settings.shadows_probes, settings.shadows_samples)
     direct.glossy = settings.glossy_rays if plan.glossy and settings.glossy == "rays" else 0
     direct.alpha_max = plan.alpha_max
@@ -379,14 +379,12 @@ def _irradiance(
             scene, world, max(1, settings.gather_rays // 4), settings.seed, settings.cones_count, cone, part.with_before
         )
         return gather_all(launcher, part.points, part.count, fewer)
-    pixel = point_pixels(launcher, buffer)
     synthetic = Gatherer(
         scene, world, settings.gather_object_rays, settings.seed, settings.cones_count, cone, part.with_before
     )
     before, after = gather_sparse(
         launcher,
         buffer,
-        pixel,
         Role.REAL,
         real,
         stride=settings.gather_stride,
@@ -398,7 +396,6 @@ def _irradiance(
         object_before, object_after = gather_sparse(
             launcher,
             buffer,
-            pixel,
             Role.SYNTHETIC,
             synthetic,
             stride=settings.gather_object_stride,
@@ -414,6 +411,7 @@ def _shade_specular(launcher: Launcher, scene: DeviceScene, plan: Plan, light_fi
     index, count = find_glossy(launcher, part.points, part.count, plan.alpha_max)
     glossy = specular.Glossy()
     glossy.rays = settings.glossy_rays
+    glossy.edge_samples = max(1, settings.antialias)
     glossy.light_samples = settings.shadows_samples
     glossy.seed = settings.seed
     glossy.alpha_max = plan.alpha_max

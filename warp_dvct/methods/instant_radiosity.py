@@ -421,6 +421,7 @@ def direct_settings(plan: Plan, region: Region, scene: Scene, with_before: bool)
     settings = plan.settings
     direct = shading.Direct()
     direct.samples = settings.shadows_samples
+    direct.edge_samples = max(1, settings.antialias)
     direct.probes = min(settings.shadows_probes, settings.shadows_samples)
     direct.glossy = settings.glossy_rays if plan.glossy and (settings.bounces or has_dome(scene.lights)) else 0
     direct.alpha_max = plan.alpha_max

@@ -87,22 +87,9 @@ def keep_rays(launcher: Launcher, slots: int, rays: int) -> Any:
     return kept
 
 
-def point_pixels(launcher: Launcher, buffer: GBuffer) -> Any:
-    """The pixel of each shading point, int ``[count]``."""
-    pixel = launcher.empty(buffer.count, wp.int32)
-    launcher.launch(
-        reconstruction._point_pixels,
-        buffer.count,
-        [buffer.edge_pixel, buffer.width * buffer.height, max(1, buffer.edge_samples)],
-        [pixel],
-    )
-    return pixel
-
-
 def gather_sparse(
     launcher: Launcher,
     buffer: GBuffer,
-    pixel: Any,
     role: Role,
     gatherer: Gatherer,
     *,
@@ -152,7 +139,7 @@ def gather_sparse(
     launcher.launch(
         reconstruction._reconstruct,
         buffer.count,
-        [buffer.points, pixel, buffer.width, int(role), guide, choice, *sparse],
+        [buffer.points, buffer.width, int(role), guide, choice, *sparse],
         [before, after, missing],
     )
     _, index, left = compact(launcher, missing)

@@ -11,7 +11,6 @@ import warp as wp
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import vpl_bounces, vpl_shading
 from warp_dvct.launch import Launcher
-from warp_dvct.passes.gather import point_pixels
 from warp_dvct.passes.gbuffer import GBuffer, compact
 from warp_dvct.passes.point_cloud import SurfacePoints
 from warp_dvct.passes.vpls import LUMINANCE
@@ -85,7 +84,7 @@ def light_picture(launcher: Launcher, buffer: GBuffer, light: VplLight) -> tuple
         buffer.count,
         [
             buffer.points,
-            point_pixels(launcher, buffer),
+            buffer.points.pixel,
             buffer.width,
             buffer.height,
             light.tiles,
