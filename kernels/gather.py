@@ -268,6 +268,7 @@ def _gather_rays(
     geo: Geometry,
     world: World,
     rays: int,
+    stride: int,
     seed: int,
     kept_out: KeptRays,
     before_out: wp.array(dtype=wp.vec3),
@@ -276,7 +277,7 @@ def _gather_rays(
 ):
     """Irradiance [W m^-2] from indirect light and domes, by cosine-distributed exact rays (eq. 6's integral).
 
-    ``nearness_out`` is the mean inverse distance of what the rays met.
+    ``stride`` is the spacing of the gathered points in pixels. ``nearness_out`` is the mean inverse distance of what the rays met.
     """
     i = first + wp.tid()
     j = index_in[i]
@@ -289,9 +290,9 @@ def _gather_rays(
             known = False
             if kept_out.present != 0:
                 known = kept_out.point[i] == j
-            start = first_sample(rays, points, j)
+            start = first_sample(rays, rays, stride, points, j)
             for k in range(rays):
-                local = cosine_hemisphere(sobol2(seed, points.pixel[j], start + k, 11))
+                local = cosine_hemisphere(sobol2(seed, 0, start + k, 11))
                 direction = from_frame(local, s.normal)
                 solid_angle = PI / (float(rays) * wp.max(local[2], 0.05))
                 if wp.dot(direction, s.normal_g) > 0.0:
@@ -334,7 +335,7 @@ def _gather_cones(
     if j >= 0:
         if points.role[j] != BACKGROUND:
             s = load_surface(points, j)
-            turn = 2.0 * PI * uniform1(seed, points.pixel[j], wp.max(points.slot[j], 0), 13)
+            turn = 2.0 * PI * uniform1(seed, 0, first_sample(16, 1, 1, points, j), 13)
             for k in range(cones):
                 sine2 = (float(k) + 0.5) / float(cones)
                 phi = 2.399963 * float(k) + turn

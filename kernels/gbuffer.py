@@ -34,12 +34,12 @@ NORMAL_GAP = wp.constant(0.95)
 class Points:
     """Surfaces to be shaded, structure of arrays; ``role`` is BACKGROUND where there is none.
 
-    Random numbers go by ``pixel`` and ``slot``, so that a point keeps its own wherever else the picture has edges, and
-    the points of one pixel draw from one sequence.
+    Random numbers go by ``pixel`` and ``slot`` (:func:`first_sample`), so that a point keeps its own wherever else the
+    picture has edges.
     """
 
     role: wp.array(dtype=wp.int32)
-    pixel: wp.array(dtype=wp.int32)
+    pixel: wp.array(dtype=wp.vec2i)  # column and row
     slot: wp.array(dtype=wp.int32)  # which of an edge pixel's points, from 0; or WHOLE, UNSEEN
     triangle: wp.array(dtype=wp.int32)
     position: wp.array(dtype=wp.vec3)
@@ -81,9 +81,27 @@ def share_of(samples: int, points: Points, i: int, edge_samples: int) -> int:
 
 
 @wp.func
-def first_sample(share: int, points: Points, i: int) -> int:
-    """Where a point's samples start in its pixel's sequence."""
-    return wp.max(points.slot[i], 0) * share
+def spread_bits(x: wp.uint32) -> wp.uint32:
+    """The lower 16 bits, a zero between any two."""
+    y = x & wp.uint32(0x0000FFFF)
+    y = (y | (y << wp.uint32(8))) & wp.uint32(0x00FF00FF)
+    y = (y | (y << wp.uint32(4))) & wp.uint32(0x0F0F0F0F)
+    y = (y | (y << wp.uint32(2))) & wp.uint32(0x33333333)
+    return (y | (y << wp.uint32(1))) & wp.uint32(0x55555555)
+
+
+@wp.func
+def first_sample(samples: int, share: int, stride: int, points: Points, i: int) -> int:
+    """Where a point's samples start in the one Sobol' sequence of the picture.
+
+    Blocks of ``stride`` x ``stride`` pixels take ``samples`` each along a Z curve, and a pixel's edge points ``share``
+    each. Neighbours so have parts of the sequence that complement each other: their errors differ in sign, and average
+    out under the eye's and under the reconstruction's filter (Ahmed & Wonka 2020).
+    """
+    pixel = points.pixel[i]
+    x = spread_bits(wp.uint32(pixel[0] / stride))
+    y = spread_bits(wp.uint32(pixel[1] / stride))
+    return int(x | (y << wp.uint32(1))) * samples + wp.max(points.slot[i], 0) * share
 
 
 @wp.func
@@ -144,7 +162,7 @@ def _see_real(
     hit = trace_real(geo, ray.origin, ray.direction, ray.t_max)
     spread = (cam.tan_right - cam.tan_left) / float(width)
     store_hit(geo, mats, hit, ray.origin, ray.direction, spread, i, points_out)
-    points_out.pixel[i] = i
+    points_out.pixel[i] = wp.vec2i(i % width, i / width)
     points_out.slot[i] = WHOLE
     reach_out[i] = hit.t
 
@@ -239,7 +257,7 @@ def _see_edges(
     py = float(pixel / width) + xi[1]
     at = width * height + i
     see(geo, mats, cam, px, py, width, height, at, points_out)
-    points_out.pixel[at] = pixel
+    points_out.pixel[at] = wp.vec2i(pixel % width, pixel / width)
     points_out.slot[at] = i % samples
     if i % samples == 0:
         points_out.slot[pixel] = UNSEEN

@@ -130,8 +130,8 @@ def _reconstruct(
     missing = int(0)
     if points.role[i] == role:
         pixel = points.pixel[i]
-        px = float(pixel % width) + 0.5
-        py = float(pixel / width) + 0.5
+        px = float(pixel[0]) + 0.5
+        py = float(pixel[1]) + 0.5
         stride = float(guide.stride)
         cx = int(wp.floor(px / stride))
         cy = int(wp.floor(py / stride))

@@ -152,9 +152,8 @@ def meets_objects(origin: wp.vec3, direction: wp.vec3, reach: float, direct: Dir
 
 @wp.struct
 class Draw:
-    """Which light samples a point takes: numbers ``first`` to ``first + samples`` of its pixel's sequence."""
+    """Which light samples a point takes: numbers ``first`` to ``first + samples`` of the picture's sequence."""
 
-    pixel: wp.int32
     first: wp.int32
     samples: wp.int32
     probes: wp.int32
@@ -163,16 +162,15 @@ class Draw:
 @wp.func
 def draw_of(points: Points, i: int, direct: Direct) -> Draw:
     draw = Draw()
-    draw.pixel = points.pixel[i]
     draw.samples = share_of(direct.samples, points, i, direct.edge_samples)
-    draw.first = first_sample(draw.samples, points, i)
+    draw.first = first_sample(direct.samples, draw.samples, 1, points, i)
     draw.probes = wp.min(direct.probes, draw.samples)
     return draw
 
 
 @wp.func
 def drawn_light(lights: Lights, k: int, s: Surface, draw: Draw, count: int, direct: Direct) -> LightSample:
-    return sample_light(lights, k, s.position, sobol2(direct.seed, draw.pixel, draw.first + count, 2 * k + 3))
+    return sample_light(lights, k, s.position, sobol2(direct.seed, 0, draw.first + count, 2 * k + 3))
 
 
 @wp.func

@@ -229,11 +229,10 @@ def _shade_specular_rays(
     wo = points.view[j]
     before = wp.vec3(0.0, 0.0, 0.0)
     after = wp.vec3(0.0, 0.0, 0.0)
-    pixel = points.pixel[j]
     rays = share_of(glossy.rays, points, j, glossy.edge_samples)
-    start = first_sample(rays, points, j)
+    start = first_sample(glossy.rays, rays, 1, points, j)
     for k in range(start, start + rays):
-        direction = reflect_visible(s, wo, sobol2(glossy.seed, pixel, k, 17))
+        direction = reflect_visible(s, wo, sobol2(glossy.seed, 0, k, 17))
         density = vndf_pdf(s, wo, direction)
         if wp.dot(direction, s.normal_g) > 0.0 and density > 0.0:
             weight = brdf_cos_specular(s, wo, direction) / density
@@ -243,7 +242,7 @@ def _shade_specular_rays(
                 light = blurred_along(geo, world, lights, origin, direction, density, glossy)
             else:
                 light = reflected_along(
-                    geo, mats, world, bounces, lights, origin, direction, density, glossy, 1 - s.synthetic, pixel, k
+                    geo, mats, world, bounces, lights, origin, direction, density, glossy, 1 - s.synthetic, 0, k
                 )
             after += wp.cw_mul(weight, light.after)
             if s.synthetic == 0:

@@ -158,7 +158,6 @@ def _shade_vpls(
 def _merge_tiles(
     first: int,
     points: Points,
-    pixel_in: wp.array(dtype=wp.int32),
     width: int,
     height: int,
     tiles: int,
@@ -179,9 +178,8 @@ def _merge_tiles(
     role = points.role[i]
     missing = int(0)
     if role != BACKGROUND:
-        pixel = pixel_in[i]
-        px = pixel % width
-        py = pixel / width
+        px = points.pixel[i][0]
+        py = points.pixel[i][1]
         position = points.position[i]
         normal_g = points.normal_g[i]
         normal = points.normal[i]

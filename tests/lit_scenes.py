@@ -213,7 +213,7 @@ def points_at(launcher: Launcher, positions, normals, *, role=0, color=(0.5, 0.5
     points.normal = points.normal_g = points.view = launcher.array(np.ascontiguousarray(normals), wp.vec3)
     points.base_color = points.diffuse = launcher.full(count, wp.vec3(*color), wp.vec3)
     points.reach = launcher.full(count, reach, wp.float32)
-    points.pixel = launcher.array(np.arange(count, dtype=np.int32), wp.int32)
+    points.pixel = launcher.array(np.stack([np.arange(count)] * 2, -1).astype(np.int32), wp.vec2i)
     points.slot = launcher.full(count, WHOLE, wp.int32)
     points.role = launcher.array(np.broadcast_to(np.asarray(role, np.int32), count).copy(), wp.int32)
     return points

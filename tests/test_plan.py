@@ -51,7 +51,7 @@ def test_fine_volume_is_a_cube_around_the_objects():
     edge = 1 / plan.scale
     assert edge == pytest.approx(0.4, rel=0.0906), "steps of a quarter of an octave"
     np.testing.assert_allclose(np.array(plan.origin) + 0.5 * edge, [0.5, 0.3, 0.5], atol=edge / 16)
-    assert (plan.fine.low, plan.fine.edge, plan.fine.n) == ((0.0, 0.0, 0.0), 1.0, 256)
+    assert (plan.fine.low, plan.fine.edge, plan.fine.n) == ((0.0, 0.0, 0.0), 1.0, 128)
     assert plan.coarse is not None
     corners = (np.array([[0.05] * 3, [0.95] * 3]) - plan.origin) * plan.scale
     low = np.array(plan.coarse.low)
@@ -217,7 +217,7 @@ def test_describe_names_every_pass():
         assert ("left out" in line) is not entry.needed
         assert entry.why in line
         assert ("MiB" in line) is entry.needed
-    assert "256^3" in text
+    assert "128^3" in text
     assert "64 x 48 pixels" in text
 
 
@@ -227,7 +227,7 @@ def test_plan_is_json(method):
     again = json.loads(json.dumps(plan.to_dict(), allow_nan=False))
     assert again["method"] == method
     assert [p["name"] for p in again["passes"]] == [p.name for p in plan.passes]
-    assert again["settings"]["volume_resolution"] == 256
+    assert again["settings"]["volume_resolution"] == 128
 
 
 @pytest.mark.parametrize("n", [64, 200])

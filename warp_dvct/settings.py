@@ -30,7 +30,8 @@ class Settings:
     bounces: int = _knob(6, "indirect bounces: 0 direct light only, 1 the paper's single bounce", low=0, high=64)
     antialias: int = _knob(4, "shading points per edge pixel; 0 for none", low=0, high=64)
 
-    volume_resolution: int = _knob(256, "voxels an edge of the fine volume", low=1, high=1024)
+    # Rays see no difference between 128 and the paper's 256, which cost a third of the frame more.
+    volume_resolution: int = _knob(128, "voxels an edge of the fine volume", low=1, high=1024)
     volume_scale: float = _knob(
         2.0, "edge of the fine volume over the synthetic bounding box's largest", low=1.0, high=1e3
     )
@@ -132,6 +133,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "balanced": {},
     "high": {
         "bounces": 12,
+        "volume.resolution": 256,
         "antialias": 8,
         "shadows.samples": 32,
         "shadows.probes": 16,

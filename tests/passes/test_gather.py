@@ -23,7 +23,7 @@ class Painted:
     seed: int = 0
     cone: object = None
 
-    def run(self, launcher, points, index, count, *_):
+    def run(self, launcher, points, index, count, *_, **__):
         index = index.numpy()[:count]
         places, normals = points.position.numpy()[index].astype(float), points.normal_g.numpy()[index].astype(float)
         values = np.where((index >= 0)[:, None], self.value(places, normals)[:, None] * [1.0, 2.0, 4.0], 0)

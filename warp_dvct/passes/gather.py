@@ -32,12 +32,20 @@ class Gatherer:
     with_before: bool = True
 
     def run(
-        self, launcher: Launcher, points: Any, index: Any, count: int, nearness: Any = None, kept: Any = None
+        self,
+        launcher: Launcher,
+        points: Any,
+        index: Any,
+        count: int,
+        nearness: Any = None,
+        kept: Any = None,
+        *,
+        stride: int = 1,
     ) -> tuple[Any, Any]:
         """Irradiance [W m^-2] before and after at points ``index`` (-1 gives 0): two vec3 ``[count]``.
 
         ``nearness``, float ``[count]``, receives the mean inverse distance of what rays met (cones leave it alone).
-        ``kept``: ``KeptRays`` of ``count`` slots (:func:`keep_rays`), for pixels' centres on real surfaces.
+        ``stride``: Spacing of the points in pixels. ``kept``: ``KeptRays`` of ``count`` slots (:func:`keep_rays`), for pixels' centres on real surfaces.
         """
         if nearness is None:
             nearness = launcher.empty(max(1, count), wp.float32)
@@ -53,6 +61,7 @@ class Gatherer:
                     self.scene.geometry,
                     self.world,
                     self.rays,
+                    stride,
                     self.seed,
                     kept or keep_rays(launcher, 0, 0),
                 ],
@@ -117,7 +126,7 @@ def gather_sparse(
         [choice],
     )
     nearness = launcher.zeros(columns * rows, wp.float32)
-    sparse = gatherer.run(launcher, buffer.points, choice, columns * rows, nearness, kept)
+    sparse = gatherer.run(launcher, buffer.points, choice, columns * rows, nearness, kept, stride=stride)
     guide = reconstruction.Guide()
     guide.stride, guide.columns, guide.rows = stride, columns, rows
     guide.plane, guide.sharpness, guide.reach = PLANE_TOLERANCE, NORMAL_SHARPNESS, SMOOTH_REACH

@@ -84,7 +84,6 @@ def light_picture(launcher: Launcher, buffer: GBuffer, light: VplLight) -> tuple
         buffer.count,
         [
             buffer.points,
-            buffer.points.pixel,
             buffer.width,
             buffer.height,
             light.tiles,
