@@ -84,6 +84,12 @@ class LiveSource:
         self._filtered: FilteredDepth | None = None
         self.skipped: list[str] = []
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the photographs, or of the depth images where there are none."""
+        rig = self.capture.rig
+        return (rig.color or rig.depth).size
+
     def index(self, time: float | None) -> int:
         """The frame at a time code; the first one with a known pose for None.
 

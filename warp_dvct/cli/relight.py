@@ -21,6 +21,7 @@ from warp_dvct.errors import FileError
 from warp_dvct.image import check_writable, is_display_referred, read_plate, write_exr, write_png, write_text
 
 if TYPE_CHECKING:
+    from warp_dvct.capture.live import LiveSource
     from warp_dvct.launch import Launcher
     from warp_dvct.layers import Layers
     from warp_dvct.relighter import Relighter
@@ -77,6 +78,11 @@ class Stops(click.ParamType):
     show_default=True,
     help="Curve of the preview. srgb shows a photograph unchanged.",
 )
+@click.option(
+    "--real-from",
+    metavar="CAPTURE",
+    help="Take the real scene, camera and plates from a capture's depth images, frame by frame; --frames are its.",
+)
 @stage_options
 def relight(
     stage: str,
@@ -88,9 +94,12 @@ def relight(
     exposure: float,
     curve: str,
     width: int | None,
+    real_from: str | None,
     **options: Any,
 ) -> None:
     """Insert the synthetic objects of STAGE into its real scene; write OUTPUT.exr and a PNG preview beside it."""
+    if real_from and options["camera"]:
+        raise click.UsageError("--camera does not go with --real-from: the capture's camera is taken")
     codes = _time_codes(output, frames)
     jobs = [_Job(code, *_paths(output, plate, code)) for code in codes]
     for target in {Path(job.exr).parent: job.exr for job in jobs}.values():
@@ -101,7 +110,7 @@ def relight(
     if len(waiting) < len(jobs):
         click.echo(f"{len(jobs) - len(waiting)} of {len(jobs)} frames are there and are left out", err=True)
     if waiting:
-        Run(stage, width, options, exposure, curve).render(waiting, stats)
+        Run(stage, width, options, exposure, curve, real_from).render(waiting, stats)
 
 
 @dataclass(frozen=True)
@@ -152,6 +161,7 @@ class Run:
         width: In pixels, or None for the plate's or the stage's.
         options: Further keywords of ``Relighter``.
         exposure, curve: Of the preview.
+        real_from: Capture whose depth is the real scene, or None.
     """
 
     stage: str
@@ -159,6 +169,7 @@ class Run:
     options: dict[str, Any]
     exposure: float
     curve: str
+    real_from: str | None = None
     height: int | None = None
     records: list[dict[str, Any]] = field(default_factory=list)
     noted: set[str] = field(default_factory=set)
@@ -169,25 +180,44 @@ class Run:
         from warp_dvct.launch import Launcher
         from warp_dvct.relighter import Relighter
 
-        relighter = self._open(Relighter, jobs[0])
+        live = self._live()
+        relighter = self._open(Relighter, jobs[0], live)
         preview = Launcher("cpu", self.options["threads"])
         for job in jobs:
             if job is not jobs[0]:
-                relighter.set_time(job.time)
+                if live is None:
+                    relighter.set_time(job.time)
+                else:
+                    relighter.set_scene(live.scene(job.time))
             self._note(relighter.scene.notices)
             self._frame(relighter, preview, job)
         if stats:
             write_text(stats, json.dumps(self._statistics(relighter), indent=2) + "\n")
 
-    def _open(self, make: type[Relighter], job: _Job) -> Relighter:
+    def _live(self) -> LiveSource | None:
+        """The source of real scenes where they come from a capture."""
+        if self.real_from is None:
+            return None
+        from warp_dvct.capture.live import LiveSource
+        from warp_dvct.launch import Launcher
+
+        reading = {key: self.options[key] for key in ("real", "synthetic", "strict", "purposes")}
+        launcher = Launcher(self.options["device"], self.options["threads"])
+        source = LiveSource(self.stage, self.real_from, launcher=launcher, **reading)
+        if self.width is None:
+            self.width, self.height = source.size
+        return source
+
+    def _open(self, make: type[Relighter], job: _Job, live: LiveSource | None) -> Relighter:
         """The plate decides the size: one that is named is read before the stage, so a wrong file is found at once."""
         if job.plate:
             self.height, self.width, _ = read_plate(job.plate, self.width).shape
-        relighter = make(self.stage, width=self.width, height=self.height, time=job.time, **self.options)
+        stage = self.stage if live is None else live.scene(job.time)
+        relighter = make(stage, width=self.width, height=self.height, time=job.time, **self.options)
         if relighter.scene.plate and not job.plate:
             height, width, _ = read_plate(relighter.scene.plate, self.width).shape
             if (width, height) != (relighter.width, relighter.height):
-                relighter = make(self.stage, width=width, height=height, time=job.time, **self.options)
+                relighter = make(stage, width=width, height=height, time=job.time, **self.options)
         return relighter
 
     def _frame(self, relighter: Relighter, preview: Launcher, job: _Job) -> None:
