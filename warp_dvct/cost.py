@@ -26,6 +26,7 @@ from warp_dvct.survey import Survey
 
 DEFAULT_FILE = Path(__file__).with_name("cost.json")
 REST = "rest"  # of a frame's time, what is in no pass
+SHORT = 2e-3  # seconds: in shorter passes the clock says little of threads
 SMALLEST = 5e-4  # seconds: relative errors of shorter passes do not matter
 
 Counts = dict[str, float]
@@ -199,8 +200,9 @@ def fit(samples: Sequence[Sample], *, device: str, threads: int, machine: str) -
         seconds = np.array([max(s.cpu[name], 1e-9) for s in have])
         found = non_negative(counts / np.maximum(seconds, SMALLEST)[:, None], seconds / np.maximum(seconds, SMALLEST))
         units[name] = {key: float(value) for key, value in zip(keys, found, strict=True) if value > 0.0}
-        wall = sum(s.wall[name] for s in have)
-        speedup[name] = float(np.clip(seconds.sum() / max(wall, 1e-9), 1.0, max(1.0, float(threads))))
+        gains = [s.cpu[name] / s.wall[name] for s in have if s.wall[name] > SHORT]
+        # Other work on the machine only lowers it: a high quantile is nearer to what an idle machine does.
+        speedup[name] = float(np.clip(np.quantile(gains, 0.9), 1.0, threads)) if gains else 1.0
     model = CostModel(device, threads, machine, units, speedup, 0.0)
     ratios = [math.log(sum(s.cpu.values()) / max(model.cpu_seconds(s.work), 1e-9)) for s in samples]
     return CostModel(device, threads, machine, units, speedup, float(np.std(ratios)))
@@ -237,11 +239,12 @@ def non_negative(matrix: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def machine_key(device: str) -> str:
     """Names the machine and device that a model belongs to."""
-    text = f"{platform.node()} {platform.machine()} {_processor()} {os.cpu_count()} {device}"
+    text = f"{platform.node()} {platform.machine()} {processor()} {os.cpu_count()} {device}"
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def _processor() -> str:
+def processor() -> str:
+    """The processor's name."""
     info = Path("/proc/cpuinfo")
     if info.exists():
         for line in info.read_text(errors="replace").splitlines():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from warp_dvct.passes.difference import tonemap_difference
 from warp_dvct.plan import Plan, make_plan
 from warp_dvct.scene import Notice, Role, Scene
 from warp_dvct.settings import make_settings
+
+if TYPE_CHECKING:
+    from warp_dvct.budget import Choice
 
 METHODS = ("delta-cones", "instant-radiosity", "path-trace")
 DEFAULT_WIDTH = 960
@@ -72,6 +75,7 @@ class Relighter:
         if method not in METHODS:
             raise OptionError(f"method is '{method}'; choose one of {', '.join(METHODS)}")
         self.settings = make_settings(quality, settings)
+        self._given = dict(settings or {})
         self.method = method
         self._launcher = Launcher(device, threads, check=check)
         self._stage = stage
@@ -119,6 +123,38 @@ class Relighter:
             raise OptionError("this Relighter reads a USD stage; move it by set_time, or give it a Scene to begin with")
         self._stage = scene
         self.set_time(None)
+
+    def keep_budget(
+        self, seconds: float | None = None, *, max_error: float | None = None, has_plate: bool = False
+    ) -> Choice:
+        """Choose the settings for a time, or for an error, from now on; those given by name stay as they are.
+
+        Args:
+            seconds: For one frame from scratch on this machine, without loading and compiling.
+            max_error: Mean LDR-FLIP of the picture against a truth of many bounces.
+            has_plate: Whether :meth:`render` will be given a plate.
+        Returns:
+            What was chosen, and what it is predicted to take and to miss.
+        Raises:
+            OptionError: Neither or both are given, a budget below the floor, an error out of reach, or a method whose
+                settings are not chosen this way.
+        """
+        from warp_dvct.planning import choose_settings
+
+        choice = choose_settings(
+            self.scene,
+            self.method,
+            self._launcher,
+            self.width,
+            self.height,
+            seconds=seconds,
+            max_error=max_error,
+            has_plate=has_plate,
+            fixed=self._given,
+        )
+        self.settings = choice.settings
+        self._plan(has_plate=has_plate)
+        return choice
 
     @property
     def plan(self) -> Plan:

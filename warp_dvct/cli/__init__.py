@@ -15,6 +15,7 @@ import click
 from warp_dvct.cli.bench import bench
 from warp_dvct.cli.capture import capture
 from warp_dvct.cli.place import place
+from warp_dvct.cli.calibrate import calibrate
 from warp_dvct.cli.plan import plan
 from warp_dvct.cli.probe import probe
 from warp_dvct.cli.reconstruct import reconstruct
@@ -34,7 +35,7 @@ def cli() -> None:
     """Insert synthetic objects into real scenes with physically convincing light."""
 
 
-for command in (bench, relight, plan, probe, reconstruct, settings, scenes, warmup, capture):
+for command in (bench, calibrate, relight, plan, probe, reconstruct, settings, scenes, warmup, capture):
     cli.add_command(command)
 capture.add_command(place)
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
+
+if TYPE_CHECKING:
+    from warp_dvct.budget import Choice
+    from warp_dvct.relighter import Relighter
 
 METHODS = ("delta-cones", "instant-radiosity", "path-trace")
 QUALITIES = ("draft", "balanced", "high")
@@ -51,6 +55,18 @@ _STAGE_OPTIONS = (
         help="Change one setting of the preset, as bounces=2. May be repeated.",
     ),
     click.option(
+        "--budget",
+        type=float,
+        metavar="SECONDS",
+        help="Choose the settings so that a frame from scratch takes about as long, instead of --quality.",
+    ),
+    click.option(
+        "--max-error",
+        type=float,
+        metavar="FLIP",
+        help="Choose the cheapest settings whose predicted mean LDR-FLIP is no larger, instead of --quality.",
+    ),
+    click.option(
         "--camera", "-cam", metavar="PATH", help="Camera by its prim path or name. Needed where there are several."
     ),
     click.option(
@@ -80,6 +96,22 @@ _STAGE_OPTIONS = (
     ),
     click.option("--strict", is_flag=True, help="What the stage has and this tool does not model is an error."),
 )
+
+
+def keep_budget(
+    relighter: Relighter, budget: float | None, max_error: float | None, *, has_plate: bool
+) -> Choice | None:
+    """Choose settings where a budget or an error was asked for.
+
+    Raises:
+        UsageError: ``--quality`` is given as well. OptionError: What was asked for cannot be had.
+    """
+    if budget is None and max_error is None:
+        return None
+    source = click.get_current_context().get_parameter_source("quality")
+    if source == click.core.ParameterSource.COMMANDLINE:
+        raise click.UsageError("--budget and --max-error choose what --quality would; give one of them")
+    return relighter.keep_budget(budget, max_error=max_error, has_plate=has_plate)
 
 
 def stage_options(function: Callable[..., Any]) -> Callable[..., Any]:

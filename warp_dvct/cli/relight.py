@@ -14,13 +14,14 @@ import click
 import numpy as np
 
 from warp_dvct.cli.frames import frame_path, has_placeholder, lost_frame
-from warp_dvct.cli.options import stage_options
+from warp_dvct.cli.options import keep_budget, stage_options
 from warp_dvct.cli.progress import Progress
 from warp_dvct.cli.quiet import start_warp
 from warp_dvct.errors import FileError
 from warp_dvct.image import check_writable, is_display_referred, read_plate, write_exr, write_png, write_text
 
 if TYPE_CHECKING:
+    from warp_dvct.budget import Choice
     from warp_dvct.capture.live import LiveSource
     from warp_dvct.launch import Launcher
     from warp_dvct.layers import Layers
@@ -95,6 +96,8 @@ def relight(
     curve: str,
     width: int | None,
     real_from: str | None,
+    budget: float | None,
+    max_error: float | None,
     **options: Any,
 ) -> None:
     """Insert the synthetic objects of STAGE into its real scene; write OUTPUT.exr and a PNG preview beside it."""
@@ -110,7 +113,7 @@ def relight(
     if len(waiting) < len(jobs):
         click.echo(f"{len(jobs) - len(waiting)} of {len(jobs)} frames are there and are left out", err=True)
     if waiting:
-        Run(stage, width, options, exposure, curve, real_from).render(waiting, stats)
+        Run(stage, width, options, exposure, curve, real_from, budget, max_error).render(waiting, stats)
 
 
 @dataclass(frozen=True)
@@ -162,6 +165,7 @@ class Run:
         options: Further keywords of ``Relighter``.
         exposure, curve: Of the preview.
         real_from: Capture whose depth is the real scene, or None.
+        budget, max_error: Seconds of a frame, or FLIP, for which the settings are chosen at the first frame; or None.
     """
 
     stage: str
@@ -170,6 +174,9 @@ class Run:
     exposure: float
     curve: str
     real_from: str | None = None
+    budget: float | None = None
+    max_error: float | None = None
+    choice: Choice | None = None
     height: int | None = None
     records: list[dict[str, Any]] = field(default_factory=list)
     noted: set[str] = field(default_factory=set)
@@ -182,6 +189,10 @@ class Run:
 
         live = self._live()
         relighter = self._open(Relighter, jobs[0], live)
+        has_plate = jobs[0].plate is not None or relighter.scene.plate is not None
+        self.choice = keep_budget(relighter, self.budget, self.max_error, has_plate=has_plate)
+        if self.choice is not None:
+            click.echo(self.choice.describe(), err=True)
         preview = Launcher("cpu", self.options["threads"])
         for job in jobs:
             if job is not jobs[0]:
@@ -268,6 +279,8 @@ class Run:
             "plan": relighter.plan.to_dict(),
             "notices": sorted(self.noted),
         }
+        if self.choice is not None:
+            result["budget"] = self.choice.to_dict()
         if len(self.records) > 1:
             result["frames"] = [{k: r[k] for k in ("frame", "file", "render_seconds", "passes")} for r in self.records]
         return result
