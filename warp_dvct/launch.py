@@ -99,6 +99,20 @@ class Launcher:
     def _scope_name(self) -> str:
         return self._scopes[-1][0] if self._scopes else "loading the scene"
 
+    def differentiate(
+        self, kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any], seeds: dict[Any, Any]
+    ) -> None:
+        """Run a kernel and its adjoint, on one CPU thread: adjoints of elements may share a target.
+
+        Args:
+            seeds: The gradient of a scalar by each output that counts, as an array of the output's shape. Afterwards
+                the ``grad`` of every input that requires one holds the scalar's gradient by that input.
+        """
+        self.load(kernel.module)
+        with wp.Tape() as tape:
+            self._launch_slab(kernel, 0, count, inputs, outputs)
+        tape.backward(grads=seeds)
+
     def _launch_slabs(self, kernel, waiting: deque[int], slab: int, count: int, inputs, outputs) -> None:
         """Take slabs until none is left. A recorded launch costs a fifth of a new one, and both hold Python's lock."""
         command: Any = wp.launch(
