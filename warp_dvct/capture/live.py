@@ -21,13 +21,13 @@ from warp_dvct.errors import FileError, OptionError, StageError
 from warp_dvct.image import srgb_to_linear
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.depth_filter import DepthFilter, FilteredDepth, FilterOptions
-from warp_dvct.scene import Camera, Material, Role, Scene
+from warp_dvct.scene import Camera, Light, LightKind, Material, Notice, Role, Scene
 
 if TYPE_CHECKING:
     from pxr import Usd
 
 ALBEDO = (0.02, 0.95)  # what surfaces reflect, at least and at most
-GREY = 0.5  # albedo where no photograph shows a surface
+GREY = 0.5  # albedo where no photograph shows a surface; the mean one of all surfaces, where light is not known
 SRGB = srgb_to_linear(np.arange(256) / 255.0)
 
 Progress = Callable[[int, int], None]
@@ -39,10 +39,13 @@ class LiveOptions:
 
     Attributes:
         stride: Pixels of the depth image between vertices.
+        surroundings: Whether what no depth image shows sends light: a dome of the photographs' mean colour, unless the
+            stage has a dome. Without it, it is black.
         filter: Of the depth.
     """
 
     stride: int = 2
+    surroundings: bool = True
     filter: FilterOptions = field(default_factory=FilterOptions)
 
     def __post_init__(self) -> None:
@@ -82,6 +85,7 @@ class LiveSource:
         self._filter = DepthFilter(launcher, lens, depth.size, self._options.filter)
         self._next = 0
         self._filtered: FilteredDepth | None = None
+        self._mean: np.ndarray | None = None
         self.skipped: list[str] = []
 
     @property
@@ -130,15 +134,24 @@ class LiveSource:
             view=camera,
             plate=self.capture.color_file(index),
             allow_empty_roles=True,
+            allow_no_light=True,
             **self._reading,
         )
         kept = tuple(mesh for mesh in scene.meshes if mesh.role == Role.SYNTHETIC)
         clouds = tuple(cloud for cloud in scene.point_clouds if cloud.role == Role.SYNTHETIC)
         grid = self._grid(filtered)
-        albedo = np.full((len(grid.points), 3), GREY) if color is None else _albedo(grid, color, rig)
+        lights, gain, notices = self._lights(scene)
+        albedo = np.full((len(grid.points), 3), GREY) if color is None else _albedo(grid, color, rig, gain)
         mesh = grid_mesh(grid, pose, len(scene.materials), albedo, self.capture.depth_path)
         lambert = Material(base_color=(1.0, 1.0, 1.0), roughness=1.0, ior=1.0, name=f"{self.capture.depth_path} (live)")
-        return replace(scene, meshes=(mesh, *kept), materials=(*scene.materials, lambert), point_clouds=clouds)
+        return replace(
+            scene,
+            meshes=(mesh, *kept),
+            materials=(*scene.materials, lambert),
+            point_clouds=clouds,
+            lights=lights,
+            notices=(*scene.notices, *notices),
+        )
 
     def filtered(self, time: float | None = None) -> FilteredDepth:
         """The filtered depth of a frame, in the depth camera."""
@@ -168,6 +181,26 @@ class LiveSource:
         assert self._filtered is not None
         return self._filtered
 
+    def _lights(self, scene: Scene) -> tuple[tuple[Light, ...], np.ndarray, tuple[Notice, ...]]:
+        """Lights, what to multiply photographs by to have albedo, and what to tell the user.
+
+        Where the stage has no light at all, the dome is so bright that the mean albedo is :data:`GREY`. Else light is
+        taken to make surfaces as bright as their albedo, which is the paper's choice (Knecht et al. 2012).
+        """
+        known = any(light.kind == LightKind.DOME for light in scene.lights)
+        if known or (scene.lights and not self._options.surroundings):
+            return scene.lights, np.ones(3), ()
+        if self._mean is None:
+            first = self.capture.color(self.index(None))
+            self._mean = np.full(3, GREY) if first is None else np.maximum(SRGB[first].mean((0, 1)), ALBEDO[0])
+        mean = self._mean
+        gain = np.ones(3) if scene.lights else GREY / mean
+        radiance = mean / (1.0 if scene.lights else GREY)
+        path = f"{self.capture.depth_path} (surroundings)"
+        dome = Light(LightKind.DOME, (float(radiance[0]), float(radiance[1]), float(radiance[2])), path=path)
+        said = "the stage has no dome light: what no depth image shows is taken as bright as the photographs' mean"
+        return (*scene.lights, dome), gain, (Notice(self.capture.path, said),)
+
     def _grid(self, filtered: FilteredDepth) -> Grid:
         options = self._options.filter
         limits = GridLimits(options.edge * options.noise, options.edge_share)
@@ -183,9 +216,9 @@ def _view(capture: Capture, index: int, pose: np.ndarray, *, has_color: bool) ->
     return lens.scene_camera(pose @ np.linalg.inv(rig.depth_to_color) if has_color else pose, path)
 
 
-def _albedo(grid: Grid, color: np.ndarray, rig: Any) -> np.ndarray:
-    """The photograph's linear colours at the vertices: the paper's albedo (Knecht et al. 2012, section 4)."""
+def _albedo(grid: Grid, color: np.ndarray, rig: Any, gain: np.ndarray) -> np.ndarray:
+    """The photograph's linear colours at the vertices times ``gain``."""
     turn, shift = rig.depth_to_color[:3, :3], rig.depth_to_color[:3, 3]
     uv = rig.color.project(grid.points @ turn.T + shift)
     values, inside = sample(SRGB[color], uv)
-    return np.where(inside[:, None], np.clip(values, *ALBEDO), GREY)
+    return np.where(inside[:, None], np.clip(values * gain, *ALBEDO), GREY)

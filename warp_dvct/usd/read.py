@@ -42,6 +42,7 @@ def read_stage(
     allow_empty_roles: bool = False,
     images: ImageCache | None = None,
     view: Camera | None = None,
+    allow_no_light: bool = False,
 ) -> Scene:
     """Read a stage.
 
@@ -58,6 +59,7 @@ def read_stage(
             invisible at this time are accepted always.
         images: Keeps image files over several calls.
         view: Take this camera, and the plate that is given; then the stage needs no camera.
+        allow_no_light: Accept a stage without any light.
     Returns:
         The scene in metres, y up; its ``notices`` list what was met and is not modelled.
     Raises:
@@ -81,6 +83,8 @@ def read_stage(
             if eye is not None:
                 view, plate = read_camera(eye, ctx), read_plate(eye, ctx, plate)
             assert view is not None
+            if not (found.lights_defined or allow_no_light):
+                raise StageError(f"{name_of(stage)} has no light; add a UsdLux light")
             scene = _assemble(ctx, view, plate and os.fspath(plate), found, images or ImageCache())
         except StageError as error:
             # What is missing is often in the file that did not load.
@@ -94,8 +98,6 @@ def read_stage(
 
 def _assemble(ctx: Context, camera: Camera, plate: str | None, found: Collection, images: ImageCache) -> Scene:
     """Read everything that the walk found."""
-    if not found.lights_defined:
-        raise StageError(f"{name_of(ctx.stage)} has no light; add a UsdLux light")
     materials = Materials(ctx, images)
     meshes, clouds = _GeometryBuilder(ctx, materials).build(found.geometry)
     lights: list[Light] = []
