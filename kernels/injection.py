@@ -64,6 +64,16 @@ def _find_targets(
     key_out[texels + i] = wp.where(before >= 0, before, EMPTY_KEY)
 
 
+@wp.func
+def wide(v: wp.vec3) -> wp.vec3d:
+    return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
+
+
+@wp.func
+def narrow(v: wp.vec3d) -> wp.vec3:
+    return wp.vec3(float(v[0]), float(v[1]), float(v[2]))
+
+
 @wp.kernel
 def _inject(
     first: int,
@@ -85,7 +95,7 @@ def _inject(
     """Add the texels of one record to its faces: eq. 2's cosine becomes the share max(0, n . e) of each face.
 
     A texel whose first surface is synthetic adds +flux there (after) and has its real surface's flux in before alone,
-    so that after - before holds the paper's -flux: the split-injection.
+    so that after - before holds the paper's -flux: the split-injection. Sums are double: a voxel may get 10^7 texels.
     """
     i = first + wp.tid()
     record = record_in[i]
@@ -93,17 +103,18 @@ def _inject(
     if i + 1 < runs:
         end = start_in[i + 1]
     for face in range(6):
-        before = wp.vec3(0.0, 0.0, 0.0)
-        after = wp.vec3(0.0, 0.0, 0.0)
+        before = wide(wp.vec3(0.0, 0.0, 0.0))
+        after = wide(wp.vec3(0.0, 0.0, 0.0))
         for j in range(start_in[i], end):
             entry = order_in[j]
             if entry < texels:
                 share = face_weight(normal_after_in[entry], face)
                 if share > 0.0:
-                    after += flux_after_in[entry] * share
+                    after += wide(flux_after_in[entry] * share)
                     if role_after_in[entry] == 0 and role_before_in[entry] == 0:
-                        before += flux_after_in[entry] * share
+                        before += wide(flux_after_in[entry] * share)
             else:
-                before += flux_before_in[entry - texels] * face_weight(normal_before_in[entry - texels], face)
-        flux_out[(record * 6 + face) * 2] += before * inverse_face
-        flux_out[(record * 6 + face) * 2 + 1] += after * inverse_face
+                share = face_weight(normal_before_in[entry - texels], face)
+                before += wide(flux_before_in[entry - texels] * share)
+        flux_out[(record * 6 + face) * 2] += narrow(before) * inverse_face
+        flux_out[(record * 6 + face) * 2 + 1] += narrow(after) * inverse_face

@@ -11,7 +11,8 @@ from warp_dvct.kernels.volume import BRICK, brick_extent, cell_key, face_weight,
 wp.set_module_options({"enable_backward": False})
 
 EMPTY_KEY = wp.constant(0x7FFFFFFF)  # sorts behind every voxel
-SLIVER = wp.constant(1.0e-7)  # voxel faces; smaller cuts are rounding where a triangle only touches a voxel
+SLIVER = wp.constant(1.0e-7)  # voxel faces; smaller cuts are rounding where a triangle only touches a voxel,
+SLIVER_SHARE = wp.constant(1.0e-3)  # unless they are more than this share of a triangle that is itself so small
 MAX_CORNERS = wp.constant(10)  # a triangle cut by six planes has at most nine corners
 
 Corners = wp.types.matrix(shape=(10, 3), dtype=wp.float32)
@@ -306,6 +307,7 @@ def _cut_fragments(
     bricks = brick_extent(n, 0)
     start = tile_cell(tile_in[i], bricks)
     span = voxel_span(triangle, start, n)
+    least = wp.min(SLIVER, 0.5 * SLIVER_SHARE * wp.length(triangle.normal))
     for z in range(span.low[2], span.high[2] + 1):
         for y in range(span.low[1], span.high[1] + 1):
             for x in range(span.low[0], span.high[0] + 1):
@@ -313,7 +315,7 @@ def _cut_fragments(
                 if overlaps(triangle, corner, 1.0):
                     moments = polygon_moments(cut_triangle(triangle, corner))
                     centroid = wp.vec3(moments[0], moments[1], moments[2])
-                    mine = moments[3] > SLIVER
+                    mine = moments[3] > least
                     for axis in range(3):
                         # The outermost voxels are closed on the far side too: a wall may lie on the box's border.
                         index_along = wp.where(axis == 0, x, wp.where(axis == 1, y, z))
@@ -467,8 +469,8 @@ def _sum_areas(
     if i + 1 < records:
         end = record_start_in[i + 1]
     for face in range(6):
-        real = float(0.0)
-        synthetic = float(0.0)
+        real_sum = wp.float64(0.0)  # double: a voxel may hold a million fragments
+        synthetic_sum = wp.float64(0.0)
         for j in range(record_start_in[i], end):
             fragment = order_in[j]
             triangle = triangle_in[fragment]
@@ -477,9 +479,11 @@ def _sum_areas(
             if double_sided_in[triangle] != 0:
                 shown += face_weight(-normal, face)
             if triangle >= synthetic_first:
-                synthetic += shown * fragment_in[fragment][3]
+                synthetic_sum += wp.float64(shown * fragment_in[fragment][3])
             else:
-                real += shown * fragment_in[fragment][3]
+                real_sum += wp.float64(shown * fragment_in[fragment][3])
+        real = float(real_sum)
+        synthetic = float(synthetic_sum)
         area_out[i * 6 + face] = wp.vec2(real, wp.min(real + synthetic, wp.max(wp.max(real, synthetic), 1.0)))
 
 
