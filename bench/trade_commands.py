@@ -98,6 +98,61 @@ def tradeoff(stages: tuple[str, ...], cache: Path | None, html: Path | None, **r
         click.echo(str(write_page(html, options.out, measured, [command])))
 
 
+@click.command()
+@click.option(
+    "--stage", "stages", multiple=True, help="A bundled stage or a USD file; repeatable. Default: all lit ones."
+)
+@click.option(
+    "--budget", "budgets", type=float, multiple=True, default=(0.5, 1, 2, 5, 10, 20), show_default=True, help="Seconds."
+)
+@click.option("--method", type=click.Choice(("delta-cones", "path-trace")), default="delta-cones", show_default=True)
+@click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="A setting that is not chosen.")
+@click.option("--width", type=click.IntRange(min=16), default=320, show_default=True, help="Pixels across.")
+@click.option("--spp", "samples", type=int, default=96, show_default=True, help="Of the truth; 0 measures no error.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Of the truth's random numbers.")
+@click.option("--cache", type=FILE, help="References; default: warp_dvct in the user's cache.")
+@click.option("--out", type=FILE, metavar="FILE", help="Add the rows to this file of JSON lines.")
+@click.option("--device", default="cpu", show_default=True, help="cpu or cuda:N.")
+@click.option("--threads", type=int, help="CPU threads; all cores by default.")
+def budget(stages: tuple[str, ...], pairs: tuple[str, ...], cache: Path | None, out: Path | None, **rest: Any) -> None:
+    """Budgets against actual times, and predicted against measured errors: whether relight --budget keeps its word."""
+    start_warp(rest["device"])
+    from warp_dvct.bench import budget as module
+    from warp_dvct.bench.error import LIT_STAGES
+    from warp_dvct.bench.rows import append_row, provenance, read_rows
+
+    if out is not None:
+        read_rows(out)
+    options = module.BudgetOptions(settings=settings_of(pairs), cache=cache or cache_folder() / "references", **rest)
+    taken, rows = provenance(), []
+    click.echo(module.HEAD)
+    for stage in stages or LIT_STAGES:
+        rows += module.measure(stage, options, lambda row: click.echo(module.format_row(row)))
+    if out is not None:
+        for row in rows:
+            append_row(out, {**row, **taken})
+    click.echo(module.summarise(rows))
+
+
+@click.command("error-table")
+@click.argument("files", type=FILE, nargs=-1, required=True)
+@click.option("--out", type=FILE, metavar="FILE", help="Write the table there, as warp_dvct/accuracy.json.")
+def error_table(files: tuple[Path, ...], out: Path | None) -> None:
+    """Fit what relight --budget predicts errors from to the rows of bench tradeoff in FILES."""
+    start_warp("cpu")
+    from warp_dvct.bench import error_table as module
+
+    table, pairs = module.fit_table([row for file in files for row in _some_rows(file, "tradeoff")])
+    ratios = [measured / max(predicted, 1e-9) for _, measured, predicted in pairs]
+    near = sum(1 / 1.5 <= ratio <= 1.5 for ratio in ratios)
+    click.echo(f"{len(pairs)} points; predicted within a factor of 1.5: {near}; spread {table.spread:.0%}")
+    for (name, measured, predicted), ratio in zip(pairs, ratios, strict=True):
+        if not 1 / 1.5 <= ratio <= 1.5:
+            click.echo(f"  {name}: measured {measured:.4f}, predicted {predicted:.4f}")
+    if out is not None:
+        module.write_table(table, out)
+
+
 def repeat_command() -> str:
     """The command line that is being run, with what differs from the defaults."""
     context = click.get_current_context()
@@ -124,4 +179,4 @@ def _some_rows(file: Path, kind: str) -> list[dict[str, Any]]:
     return rows
 
 
-TRADE_COMMANDS = (backends, tradeoff)
+TRADE_COMMANDS = (backends, tradeoff, budget, error_table)

@@ -27,6 +27,7 @@ TABLE_FILE = Path(__file__).with_name("accuracy.json")
 AIM = 0.95  # of the budget: the model's own spread is then inside of it
 VOXELS_PER_FEATURE = 2.0  # across the smallest extent of an object, for its light not to pass through it
 MOST_RAYS = 65536
+CLOSED = 0.8  # share of gathered rays that meet a surface: above it a scene counts as a closed room
 OBJECT_STRIDE = {16: 8, 12: 6, 8: 4, 6: 3, 4: 2, 2: 1, 1: 1}
 
 
@@ -68,8 +69,9 @@ class Accuracy:
 
     Attributes:
         base: Coefficients of the logarithm of FLIP at the balanced preset: see :meth:`balanced`.
-        knobs: By class of scene (``diffuse``, ``glossy``) and knob: values, and by how much squared FLIP exceeds that
-            of the balanced preset, over it.
+        knobs: By class of scene and knob: values, and by how much squared FLIP exceeds that of the balanced preset with
+            many bounces, over it. Knobs of further bounces go by ``open`` and ``closed`` scenes, the others by
+            ``diffuse`` and ``glossy`` ones.
         spread: Standard deviation of the logarithm of measured over predicted FLIP.
     """
 
@@ -79,23 +81,27 @@ class Accuracy:
 
     def balanced(self, survey: Survey, width: int) -> float:
         """FLIP of the balanced preset: a power of the affected share, by class, and of the picture's width."""
-        kind = _kind(survey)
         share = max(survey.affected, 1e-3)
         power = self.base["width"] * math.log(width / 320.0)
-        return math.exp(self.base[kind] + self.base["affected"] * math.log(share) + power)
+        return math.exp(self.base[kind_of(survey)] + self.base["affected"] * math.log(share) + power)
 
     def error(self, settings: Settings, survey: Survey, width: int) -> float:
         """Mean LDR-FLIP of the picture against many bounces."""
         if not survey.changes:
             return 0.0
-        excess = sum(self.excess(knob, getattr(settings, NAMES[knob]), survey) for knob in self.knobs[_kind(survey)])
-        return self.balanced(survey, width) * math.sqrt(max(1.0 + excess, 0.02))
+        factor, added = 1.0, 0.0
+        for ladder in LADDERS:
+            excess = self.excess(ladder.knob, getattr(settings, NAMES[ladder.knob]), survey)
+            # Independent errors add up; what improves takes a share off what the others left.
+            added += max(excess, 0.0)
+            factor *= 1.0 + min(excess, 0.0)
+        return self.balanced(survey, width) * math.sqrt(factor * (1.0 + added))
 
     def excess(self, knob: str, value: float, survey: Survey) -> float:
         """Of squared FLIP over the balanced preset's, where only ``knob`` is at ``value``."""
         if not _matters(knob, survey):
             return 0.0
-        table = self.knobs[_kind(survey)].get(knob)
+        table = self.knobs.get(class_of(knob, survey), {}).get(knob)
         if not table:
             return 0.0
         values, excess = np.array(table).T
@@ -347,7 +353,15 @@ _WHY = {
 }
 
 
-def _kind(survey: Survey) -> str:
+def class_of(knob: str, survey: Survey) -> str:
+    """The class of scenes whose table a knob's errors are in."""
+    if knob in ("bounces", "patches.count"):
+        return "closed" if survey.met > CLOSED else "open"
+    return kind_of(survey)
+
+
+def kind_of(survey: Survey) -> str:
+    """``diffuse``, or ``glossy`` where a lobe is traced by itself."""
     return "diffuse" if survey.roughness is None else "glossy"
 
 

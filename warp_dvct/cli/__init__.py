@@ -13,9 +13,9 @@ from types import FrameType
 import click
 
 from warp_dvct.cli.bench import bench
+from warp_dvct.cli.calibrate import calibrate
 from warp_dvct.cli.capture import capture
 from warp_dvct.cli.place import place
-from warp_dvct.cli.calibrate import calibrate
 from warp_dvct.cli.plan import plan
 from warp_dvct.cli.probe import probe
 from warp_dvct.cli.reconstruct import reconstruct

@@ -1,0 +1,153 @@
+"""Whether ``relight --budget`` keeps its word: budgets over stages, predicted against actual time and error."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warp_dvct.bench.error import MANY_BOUNCES, read, stage_file
+from warp_dvct.bench.references import ReferenceStore
+from warp_dvct.errors import OptionError
+from warp_dvct.launch import Launcher
+from warp_dvct.metrics import flip_ldr, import_flip
+
+KIND = "budget"
+LATEST = 1.25  # of the budget: never later
+NEAR = 0.25  # of the budget: how near the actual time is to be
+ERROR_FACTOR = 1.5  # between predicted and measured error
+
+
+@dataclass(frozen=True)
+class BudgetOptions:
+    """What is measured; the fields are the command's flags. ``samples`` are of the truth; 0 measures no error."""
+
+    budgets: tuple[float, ...] = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
+    width: int = 320
+    samples: int = 96
+    method: str = "delta-cones"
+    settings: dict[str, str] = field(default_factory=dict)
+    seed: int = 1
+    cache: Path = Path()
+    device: str = "cpu"
+    threads: int | None = None
+
+
+def measure(
+    stage: str, options: BudgetOptions, report: Callable[[dict[str, Any]], None] = lambda row: None
+) -> list[dict[str, Any]]:
+    """A row per budget: one frame with a plate after a small warm-up; budgets below the floor say so.
+
+    Raises:
+        OptionError: No budget, or as the relighter raises.
+    """
+    if not options.budgets:
+        raise OptionError("there is no budget to keep; give --budget SECONDS")
+    from warp_dvct.relighter import Relighter
+
+    scene = read(stage_file(stage))
+    height = max(1, round(options.width / scene.camera.aspect))
+    size = {"width": options.width, "height": height, "device": options.device, "threads": options.threads}
+    truth = None
+    if options.samples:
+        import_flip()
+        launcher = Launcher(options.device, options.threads)
+        store = ReferenceStore(
+            scene,
+            options.width,
+            height,
+            samples=options.samples,
+            seed=options.seed,
+            cache=options.cache,
+            launcher=launcher,
+        )
+        truth = store.get(MANY_BOUNCES)
+    plate = truth.before if truth else np.full((height, options.width, 3), 0.5, np.float32)
+    small = Relighter(scene, method=options.method, width=48, device=options.device, threads=options.threads)
+    small.render(np.full((small.height, 48, 3), 0.5, np.float32))  # compiles
+    rows = []
+    for budget in options.budgets:
+        row: dict[str, Any] = {"kind": KIND, "stage": Path(stage).stem, "width": options.width, "height": height}
+        relighter = Relighter(scene, method=options.method, settings=options.settings, **size)
+        start, cpu = time.perf_counter(), time.process_time()
+        try:
+            choice = relighter.keep_budget(budget, has_plate=True)
+        except OptionError as error:
+            rows.append({**row, "budget": budget, "refused": str(error)})
+            report(rows[-1])
+            continue
+        planning, planning_cpu = time.perf_counter() - start, time.process_time() - cpu
+        comp = relighter.render(plate).comp
+        flip = None
+        if truth is not None:
+            flip = math.sqrt(max(flip_ldr(truth.comp, comp)[0] ** 2 - truth.noise**2, 0.0))
+        rows.append(
+            {
+                **row,
+                "budget": budget,
+                "threads": relighter._launcher.threads,
+                "predicted": choice.to_dict(),
+                "seconds": planning + relighter.stats["render_seconds"],
+                "cpu_seconds": planning_cpu + relighter.stats["cpu_seconds"],
+                "passes": relighter.stats["passes"],
+                "cpu_passes": relighter.stats["cpu_passes"],
+                "flip": flip,
+            }
+        )
+        report(rows[-1])
+    return rows
+
+
+HEAD = (
+    f"{'':17}{'budget':>8}{'predicted':>11}{'actual':>8}{'ratio':>7}{'CPU s pred.':>13}{'actual':>8}{'ratio':>7}"
+    f"{'FLIP pred.':>12}{'actual':>8}{'ratio':>7}"
+)
+
+
+def format_row(row: dict[str, Any]) -> str:
+    """A line under :data:`HEAD`; ratios are actual time over budget, actual over predicted processor time, and actual
+    over predicted error."""
+    if "refused" in row:
+        return f"{row['stage']:17}{row['budget']:8.2f}  {row['refused']}"
+    predicted, flip = row["predicted"], row["flip"]
+    line = (
+        f"{row['stage']:17}{row['budget']:8.2f}{predicted['seconds']:11.2f}{row['seconds']:8.2f}"
+        f"{row['seconds'] / row['budget']:7.2f}{predicted['cpu_seconds']:13.2f}{row['cpu_seconds']:8.2f}"
+        f"{row['cpu_seconds'] / predicted['cpu_seconds']:7.2f}"
+    )
+    if flip is None or predicted["error"] is None:
+        return line
+    ratio = f"{flip / predicted['error']:7.2f}" if predicted["error"] > 0 else f"{'-':>7}"
+    return f"{line}{predicted['error']:12.4f}{flip:8.4f}{ratio}"
+
+
+def summarise(rows: Sequence[dict[str, Any]]) -> str:
+    """How many budgets were kept, by the clock and by processor time, and how many errors were predicted."""
+    kept = [r for r in rows if "refused" not in r]
+    if not kept:
+        return "every budget was below the floor"
+    clock = [r["seconds"] / r["budget"] for r in kept]
+    cpu = [r["cpu_seconds"] / r["predicted"]["cpu_seconds"] for r in kept]
+    lines = [
+        f"of {len(kept)} budgets, {_share(clock, 1 - NEAR, LATEST)} were kept within {NEAR:.0%} by the clock, and the latest"
+        f" took {max(clock):.2f} of its budget",
+        f"processor time was within {NEAR:.0%} of the prediction for {_share(cpu, 1 - NEAR, LATEST)}; from"
+        f" {min(cpu):.2f} to {max(cpu):.2f} of it",
+    ]
+    errors = [r["flip"] / r["predicted"]["error"] for r in kept if r["flip"] and r["predicted"]["error"]]
+    if errors:
+        near = _share(errors, 1 / ERROR_FACTOR, ERROR_FACTOR)
+        lines.append(
+            f"of {len(errors)} errors, {near} were predicted within a factor of {ERROR_FACTOR:g}; from {min(errors):.2f} to"
+            f" {max(errors):.2f} of the prediction"
+        )
+    return "\n".join(lines)
+
+
+def _share(ratios: Sequence[float], low: float, high: float) -> int:
+    return sum(low <= ratio <= high for ratio in ratios)
