@@ -109,13 +109,13 @@ def _continue_behind(
     return np.arange(4 * count).reshape(count, 4), rho.ravel(), owner.ravel()
 
 
-def grid_mesh(grid: Grid, pose: np.ndarray, material: int, colors: np.ndarray | None, path: str) -> Mesh:
+def grid_mesh(grid: Grid, pose: np.ndarray, material: int, uvs: np.ndarray | None, path: str) -> Mesh:
     """The grid as a real mesh in the world.
 
     Args:
         pose: Camera (OpenCV axes) to world, 4x4.
         material: Index into the scene's materials.
-        colors: Per vertex, ``[v, 3]``, multiplied into the material's base colour; None for white.
+        uvs: Texture coordinates per vertex, ``[v, 2]``, or None.
     """
     return Mesh(
         points=grid.points @ pose[:3, :3].T + pose[:3, 3],
@@ -124,6 +124,6 @@ def grid_mesh(grid: Grid, pose: np.ndarray, material: int, colors: np.ndarray | 
         role=Role.REAL,
         double_sided=True,
         corner_normals=(grid.normals @ pose[:3, :3].T).astype(np.float32)[grid.triangles],
-        corner_colors=None if colors is None else colors.astype(np.float32)[grid.triangles],
+        corner_uvs=None if uvs is None else uvs.astype(np.float32)[grid.triangles],
         path=path,
     )

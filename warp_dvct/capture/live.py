@@ -15,18 +15,19 @@ import numpy as np
 
 from warp_dvct.capture.grid import Grid, GridLimits, depth_grid, grid_mesh
 from warp_dvct.capture.intrinsics import Intrinsics
-from warp_dvct.capture.registration import sample, undistorted_depth
-from warp_dvct.capture.stage import Capture, open_capture
+from warp_dvct.capture.registration import undistorted_depth
+from warp_dvct.capture.stage import Capture, CaptureRig, open_capture
 from warp_dvct.errors import FileError, OptionError, StageError
 from warp_dvct.image import srgb_to_linear
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.depth_filter import DepthFilter, FilteredDepth, FilterOptions
-from warp_dvct.scene import Camera, Light, LightKind, Material, Notice, Role, Scene
+from warp_dvct.scene import Camera, Light, LightKind, Material, Notice, Role, Scene, Texture, Wrap
 
 if TYPE_CHECKING:
     from pxr import Usd
 
-ALBEDO = (0.02, 0.95)  # what surfaces reflect, at least and at most
+MOST_ALBEDO = 0.95  # nothing reflects more
+DARKEST = 0.02  # mean of a photograph below which its surroundings are not taken to be
 GREY = 0.5  # albedo where no photograph shows a surface; the mean one of all surfaces, where light is not known
 SRGB = srgb_to_linear(np.arange(256) / 255.0)
 
@@ -126,7 +127,6 @@ class LiveSource:
             )
         filtered = self._advance(index, progress)
         color = self.capture.color(index)
-        rig = self.capture.rig
         camera = _view(self.capture, index, pose, has_color=color is not None)
         scene = read_stage(
             self._stage,
@@ -141,13 +141,20 @@ class LiveSource:
         clouds = tuple(cloud for cloud in scene.point_clouds if cloud.role == Role.SYNTHETIC)
         grid = self._grid(filtered)
         lights, gain, notices = self._lights(scene)
-        albedo = np.full((len(grid.points), 3), GREY) if color is None else _albedo(grid, color, rig, gain)
-        mesh = grid_mesh(grid, pose, len(scene.materials), albedo, self.capture.depth_path)
-        lambert = Material(base_color=(1.0, 1.0, 1.0), roughness=1.0, ior=1.0, name=f"{self.capture.depth_path} (live)")
+        surface = Material(
+            base_color=(GREY, GREY, GREY), roughness=1.0, ior=1.0, name=f"{self.capture.depth_path} (live)"
+        )
+        textures, uvs = scene.textures, None
+        if color is not None:
+            surface = replace(surface, base_color_texture=len(textures))
+            textures = (*textures, _albedo_texture(color, gain, self.capture.color_file(index) or ""))
+            uvs = _texture_coordinates(grid, self.capture.rig)
+        mesh = grid_mesh(grid, pose, len(scene.materials), uvs, self.capture.depth_path)
         return replace(
             scene,
             meshes=(mesh, *kept),
-            materials=(*scene.materials, lambert),
+            materials=(*scene.materials, surface),
+            textures=textures,
             point_clouds=clouds,
             lights=lights,
             notices=(*scene.notices, *notices),
@@ -192,7 +199,7 @@ class LiveSource:
             return scene.lights, np.ones(3), ()
         if self._mean is None:
             first = self.capture.color(self.index(None))
-            self._mean = np.full(3, GREY) if first is None else np.maximum(SRGB[first].mean((0, 1)), ALBEDO[0])
+            self._mean = np.full(3, GREY) if first is None else np.maximum(SRGB[first].mean((0, 1)), DARKEST)
         mean = self._mean
         gain = np.ones(3) if scene.lights else GREY / mean
         radiance = mean / (1.0 if scene.lights else GREY)
@@ -216,9 +223,16 @@ def _view(capture: Capture, index: int, pose: np.ndarray, *, has_color: bool) ->
     return lens.scene_camera(pose @ np.linalg.inv(rig.depth_to_color) if has_color else pose, path)
 
 
-def _albedo(grid: Grid, color: np.ndarray, rig: Any, gain: np.ndarray) -> np.ndarray:
-    """The photograph's linear colours at the vertices times ``gain``."""
-    turn, shift = rig.depth_to_color[:3, :3], rig.depth_to_color[:3, 3]
-    uv = rig.color.project(grid.points @ turn.T + shift)
-    values, inside = sample(SRGB[color], uv)
-    return np.where(inside[:, None], np.clip(values * gain, *ALBEDO), GREY)
+def _albedo_texture(color: np.ndarray, gain: np.ndarray, name: str) -> Texture:
+    """The photograph's linear colours times ``gain``: a pixel's albedo goes by its own colour, so that it never loses
+    more light than it had."""
+    pixels = np.clip(SRGB[color] * gain, 0.0, MOST_ALBEDO).astype(np.float32)
+    return Texture(pixels, Wrap.CLAMP, Wrap.CLAMP, f"{name} (albedo)")
+
+
+def _texture_coordinates(grid: Grid, rig: CaptureRig) -> np.ndarray:
+    """Where the photograph shows the vertices, ``[v, 2]``; v = 1 is its top."""
+    assert rig.color is not None
+    uv = rig.color.project(grid.points @ rig.depth_to_color[:3, :3].T + rig.depth_to_color[:3, 3])
+    uv = np.nan_to_num((uv + 0.5) / np.array(rig.color.size), nan=0.5)
+    return np.stack([uv[:, 0], 1.0 - uv[:, 1]], -1)
