@@ -134,8 +134,8 @@ def summarise(rows: Sequence[dict[str, Any]]) -> str:
     clock = [r["seconds"] / r["budget"] for r in kept]
     cpu = [r["cpu_seconds"] / r["predicted"]["cpu_seconds"] for r in kept]
     lines = [
-        f"of {len(kept)} budgets, {_share(clock, 1 - NEAR, LATEST)} were kept within {NEAR:.0%} by the clock, and the latest"
-        f" took {max(clock):.2f} of its budget",
+        f"of {len(kept)} budgets, {_share(clock, 1 - NEAR, LATEST)} were kept within {NEAR:.0%} by the clock, and the"
+        f" latest took {max(clock):.2f} of its budget",
         f"processor time was within {NEAR:.0%} of the prediction for {_share(cpu, 1 - NEAR, LATEST)}; from"
         f" {min(cpu):.2f} to {max(cpu):.2f} of it",
     ]
@@ -143,8 +143,8 @@ def summarise(rows: Sequence[dict[str, Any]]) -> str:
     if errors:
         near = _share(errors, 1 / ERROR_FACTOR, ERROR_FACTOR)
         lines.append(
-            f"of {len(errors)} errors, {near} were predicted within a factor of {ERROR_FACTOR:g}; from {min(errors):.2f} to"
-            f" {max(errors):.2f} of the prediction"
+            f"of {len(errors)} errors, {near} were predicted within a factor of {ERROR_FACTOR:g}; from"
+            f" {min(errors):.2f} to {max(errors):.2f} of the prediction"
         )
     return "\n".join(lines)
 

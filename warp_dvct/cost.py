@@ -87,7 +87,7 @@ def count_work(settings: Settings, survey: Survey, width: int, height: int) -> d
 def _texels(need: Any, settings: Settings) -> float:
     """Of a light's maps: of the fine and the coarse volume, before and after."""
     sizes = (
-        min(max(16, math.ceil(per_voxel * n * settings.rsm_density)), settings.rsm_texels) if per_voxel else 0
+        min(max(16, math.ceil(per_voxel * n * settings.rsm_density)), settings.rsm_texels) if per_voxel * n > 0.0 else 0
         for per_voxel, n in ((need.fine, settings.volume_resolution), (need.coarse, settings.volume_coarse))
     )
     return (2 if need.pair else 1) * sum(float(size) ** 2 for size in sizes)

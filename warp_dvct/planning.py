@@ -20,7 +20,7 @@ from warp_dvct.scene import Scene
 from warp_dvct.settings import make_settings
 from warp_dvct.survey import survey
 
-PATHS = 60_000  # traced to learn what a path costs
+PATHS = 16_000  # at most, traced to learn what a path costs
 
 
 def choose_settings(
@@ -65,7 +65,8 @@ def _path_trace(
     settings = make_settings("balanced", fixed)
     plan = make_plan(scene, settings, "path-trace", width, height)
     device_scene = DeviceScene.upload(launcher, scene, np.asarray(plan.origin), plan.scale)
-    size = max(1, round(math.sqrt(PATHS * width / height))), max(1, round(math.sqrt(PATHS * height / width)))
+    shrink = min(1.0, math.sqrt(PATHS / (width * height)))
+    size = max(1, round(shrink * width)), max(1, round(shrink * height))
     tracer = PathTracer(launcher, device_scene, scene, *size, bounces=settings.bounces, seed=settings.seed)
     tracer.add(1)  # loads the kernels
     start, cpu = time.perf_counter(), time.process_time()
