@@ -31,7 +31,7 @@ class KinectNoise:
         incidence: Angles [degrees] between which the chance of a loss goes from 0 to 1, (75, 80); None for no loss.
         range: Nearest and farthest depth [m] that is measured, (0.5, 4); None for all.
         baseline: Between projector and camera [m].
-        focal: Focal length [pixels] of the sensor that measures disparity, at 640 pixels across.
+        focal: Focal length of the sensor in its own pixels, in which disparity is measured; images may be coarser.
     """
 
     disparity: float = 1.0 / 6.0
@@ -85,7 +85,7 @@ class KinectNoise:
             u = np.clip(np.rint(u + self.lateral * shift[0]), 0, shape[1] - 1).astype(np.int64)
             v = np.clip(np.rint(v + self.lateral * shift[1]), 0, shape[0] - 1).astype(np.int64)
             seen = true[v, u]
-        measured = self._measure(seen, wobble, lens.width)
+        measured = self._measure(seen, wobble)
         lost = (true <= 0.0) | (seen <= 0.0) | (measured <= 0.0)
         if self.jumps:
             lost |= beside_jump(true, normal, lens) & (luck[0] < JUMP_LOSS)
@@ -99,11 +99,11 @@ class KinectNoise:
             lost |= (measured < self.range[0]) | (measured > self.range[1])
         return np.where(lost, 0.0, measured).astype(np.float32)
 
-    def _measure(self, depth: np.ndarray, wobble: np.ndarray, width: int) -> np.ndarray:
+    def _measure(self, depth: np.ndarray, wobble: np.ndarray) -> np.ndarray:
         """Through disparity and back; 0 where disparity vanishes."""
         if self.disparity <= 0.0 and self.steps <= 0.0:
             return depth
-        scale = self.focal * width / 640.0 * self.baseline
+        scale = self.focal * self.baseline
         disparity = scale / np.where(depth > 0.0, depth, np.inf) + self.disparity * wobble
         if self.steps > 0.0:
             disparity = np.rint(disparity * self.steps) / self.steps
