@@ -134,6 +134,36 @@ def budget(stages: tuple[str, ...], pairs: tuple[str, ...], cache: Path | None, 
     click.echo(module.summarise(rows))
 
 
+@click.command()
+@click.option("--stage", default="room_area", show_default=True, help="A bundled stage or a USD file.")
+@click.option(
+    "--axis", "axes", multiple=True, help="triangles, resolution, pixels, lights, frames or threads; repeatable."
+)
+@click.option("--full", is_flag=True, help="Up to 10^7 triangles, 1024^3 voxels, 2560 pixels, 64 lights: minutes, GiB.")
+@click.option("--width", type=click.IntRange(min=1), default=160, show_default=True, help="Pixels across.")
+@click.option("--repeats", type=int, default=2, show_default=True, help="Of which the least counts.")
+@click.option("--quality", type=click.Choice(QUALITIES), default="balanced", show_default=True)
+@click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="A setting, as in warp-dvct relight.")
+@click.option("--device", default="cpu", show_default=True, help="cpu or cuda:N.")
+@click.option("--out", type=FILE, metavar="FILE", help="Add the rows to this file of JSON lines.")
+def scaling(stage: str, pairs: tuple[str, ...], out: Path | None, **rest: Any) -> None:
+    """How time and memory grow with triangles, voxels, pixels, lights, frames, threads; flags what grows too fast."""
+    start_warp(rest["device"])
+    from warp_dvct.bench import scaling as module
+    from warp_dvct.bench.rows import append_row, provenance, read_rows
+
+    if out is not None:
+        read_rows(out)
+    options = module.ScalingOptions(settings=settings_of(pairs), **rest)
+    click.echo(module.HEAD)
+    rows = module.measure(stage, options, lambda row: click.echo(module.format_row(row)))
+    if out is not None:
+        taken = provenance()
+        for row in rows:
+            append_row(out, {**row, **taken})
+    click.echo("\n" + module.format_exponents(module.exponents(rows), rows))
+
+
 @click.command("error-table")
 @click.argument("files", type=FILE, nargs=-1, required=True)
 @click.option("--out", type=FILE, metavar="FILE", help="Write the table there, as warp_dvct/accuracy.json.")
@@ -179,4 +209,4 @@ def _some_rows(file: Path, kind: str) -> list[dict[str, Any]]:
     return rows
 
 
-TRADE_COMMANDS = (backends, tradeoff, budget, error_table)
+TRADE_COMMANDS = (backends, tradeoff, scaling, budget, error_table)
