@@ -121,7 +121,7 @@ def write_capture(
     Raises:
         FileError: There are no frames, a pose is not rigid, or the file cannot be written; an earlier file stays.
     """
-    from pxr import Gf, Tf, Usd, UsdGeom
+    from pxr import Gf, Sdf, Tf, Usd, UsdGeom
 
     if not frames:
         raise FileError(f"{path}: the capture has no frames; nothing is written")
@@ -146,6 +146,9 @@ def write_capture(
         except Tf.ErrorException as error:
             raise FileError(f"{path} cannot be written: {error}") from error
         del stage
+    known = Sdf.Layer.Find(str(target))  # USD would go on with what it has read of an earlier file
+    if known is not None:
+        known.Reload(force=True)
 
 
 def _write_depth(
