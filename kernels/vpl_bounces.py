@@ -13,17 +13,25 @@ NEAREST = wp.constant(1.0e-12)
 
 
 @wp.struct
-class Slots:
-    """Which VPLs shine, which are made, and how candidates compete."""
+class Sources:
+    """The VPLs that shine, and how they are asked."""
 
-    source_first: wp.int32
-    source_count: wp.int32
-    start: wp.int32  # first slot
+    start: wp.int32
     count: wp.int32
-    sources: wp.int32  # VPLs that each candidate tries
-    strongest: wp.int32  # 1: the strongest candidate's place stands for all; 0: one drawn in proportion to its flux
+    draws: wp.int32  # that each candidate tries
     seed: wp.int32
     reach: wp.float32
+    cdf: wp.array(dtype=wp.float32)  # count + 1, of their flux
+
+
+@wp.struct
+class Candidates:
+    """What the points of a cloud send on of one class of light; the flags are those of a path drawn by flux."""
+
+    flux: wp.array(dtype=wp.vec3)
+    real: wp.array(dtype=wp.int32)
+    hidden: wp.array(dtype=wp.int32)
+    flipped: wp.array(dtype=wp.int32)
 
 
 @wp.struct
@@ -94,60 +102,83 @@ def light_point(
 
 
 @wp.kernel
-def _bounce_vpls(
-    first: int, geo: Geometry, cloud: Cloud, sight: Sight, slots: Slots, cdf_in: wp.array(dtype=wp.float32), vpls: Vpls
+def _light_candidates(
+    first: int,
+    geo: Geometry,
+    cloud: Cloud,
+    sight: Sight,
+    sources: Sources,
+    vpls: Vpls,
+    common_out: Candidates,
+    changed_out: Candidates,
 ):
-    """Slot i: every ``count``-th point of the cloud is a candidate and draws VPLs of the bounce before by their flux.
-
-    One candidate gets the slot and the flux of all of them, so the light that bounces on is kept.
-    """
-    i = first + wp.tid()
-    at = slots.start + i
-    total = float(0.0)
-    best = float(0.0)
-    flux = wp.vec3(0.0, 0.0, 0.0)
-    position = wp.vec3(0.0, 0.0, 0.0)
-    normal = wp.vec3(0.0, 0.0, 1.0)
+    """Every point of the cloud draws VPLs of the bounce before by their flux: the light of both solutions that it
+    sends on, and that of one alone."""
+    p = first + wp.tid()
+    common = wp.vec3(0.0, 0.0, 0.0)
+    changed = wp.vec3(0.0, 0.0, 0.0)
+    common_flipped = int(0)
+    changed_flipped = int(0)
     real = int(0)
     hidden = int(0)
-    p = i
-    draw = int(0)
-    while p < cloud.count:
-        for _n in range(slots.sources):
-            u = sobol1(slots.seed, at, draw, 45)
-            j = find_source(cdf_in, slots.source_count, u)
-            chance = cdf_in[j + 1] - cdf_in[j]
-            lit = light_point(
-                geo,
-                vpls,
-                sight,
-                slots.source_first + j,
-                cloud.position[p],
-                cloud.normal[p],
-                cloud.synthetic[p],
-                slots.reach,
-            )
-            share = cloud.area[p] / (wp.max(chance, 1.0e-20) * float(slots.sources))
-            leaving = wp.cw_mul(lit.flux, cloud.albedo[p]) * share
-            weight = luminance(leaving)
-            if weight > 0.0:
-                total += weight
-                take = uniform1(slots.seed, at, draw, 46) * total < weight
-                if slots.strongest != 0:
-                    take = weight > best
-                if take:
-                    best = weight
-                    flux = leaving
-                    normal = wp.where(lit.flipped != 0, -cloud.normal[p], cloud.normal[p])
-                    position = cloud.position[p]
+    for draw in range(sources.draws):
+        j = find_source(sources.cdf, sources.count, sobol1(sources.seed, p, draw, 45))
+        chance = sources.cdf[j + 1] - sources.cdf[j]
+        lit = light_point(
+            geo,
+            vpls,
+            sight,
+            sources.start + j,
+            cloud.position[p],
+            cloud.normal[p],
+            cloud.synthetic[p],
+            sources.reach,
+        )
+        leaving = wp.cw_mul(lit.flux, cloud.albedo[p]) * (
+            cloud.area[p] / (wp.max(chance, 1.0e-20) * float(sources.draws))
+        )
+        if luminance(leaving) > 0.0:
+            u = uniform1(sources.seed, p, draw, 46)
+            if lit.real != 0 and lit.hidden == 0:
+                common += leaving
+                if u * luminance(common) < luminance(leaving):
+                    common_flipped = lit.flipped
+            else:
+                changed += leaving
+                if u * luminance(changed) < luminance(leaving):
+                    changed_flipped = lit.flipped
                     real = lit.real
                     hidden = lit.hidden
-            draw += 1
-        p += slots.count
+    common_out.flux[p] = common
+    common_out.real[p] = 1
+    common_out.hidden[p] = 0
+    common_out.flipped[p] = common_flipped
+    changed_out.flux[p] = changed
+    changed_out.real[p] = real
+    changed_out.hidden[p] = hidden
+    changed_out.flipped[p] = changed_flipped
+
+
+@wp.kernel
+def _fill_slots(
+    first: int,
+    cloud: Cloud,
+    candidates: Candidates,
+    chosen_in: wp.array(dtype=wp.int32),
+    gain_in: wp.array(dtype=wp.float32),
+    start: int,
+    reach: float,
+    vpls: Vpls,
+):
+    """Slot i gets the place and the flags of its candidate, and the flux of all that it stands for."""
+    i = first + wp.tid()
+    at = start + i
+    p = chosen_in[i]
+    normal = wp.where(candidates.flipped[p] != 0, -cloud.normal[p], cloud.normal[p])
     vpls.kind[at] = SURFACE
-    vpls.position[at] = position + normal * (OFFSET_RELATIVE * slots.reach)
+    vpls.position[at] = cloud.position[p] + normal * (OFFSET_RELATIVE * reach)
     vpls.normal[at] = normal
-    vpls.flux[at] = flux * (total / wp.max(best, 1.0e-30))
-    vpls.real[at] = real
-    vpls.hidden[at] = hidden
+    vpls.flux[at] = candidates.flux[p] * gain_in[i]
+    vpls.real[at] = candidates.real[p]
+    vpls.hidden[at] = candidates.hidden[p]
     vpls.spread[at] = 0.0

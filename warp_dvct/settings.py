@@ -85,7 +85,7 @@ class Settings:
         choices=("auto", "plain", "tonemapped"),
     )
     vpls_count: int = _knob(256, "virtual point lights of the first bounce", low=1, high=2**17)
-    vpls_further: int = _knob(128, "virtual point lights of each further bounce", low=1, high=2**17)
+    vpls_further: int = _knob(256, "virtual point lights of each further bounce", low=1, high=2**17)
     vpls_sky: int = _knob(256, "virtual point lights on the sky, where there is a dome", low=1, high=2**17)
     vpls_map: int = _knob(256, "texels an edge of the maps that VPLs are drawn from", low=1, high=4096)
     vpls_focus: float = _knob(0.7, "share of VPLs that go by nearness to synthetic objects", low=0.0, high=1.0)
@@ -101,7 +101,7 @@ class Settings:
     vpls_frames: int = _knob(
         1, "most frames that are averaged, each with its own VPLs, while only the camera moves", low=1, high=2**16
     )
-    vpls_sources: int = _knob(4, "VPLs that a candidate for a further bounce tries", low=1, high=1024)
+    vpls_sources: int = _knob(8, "VPLs that a candidate for a further bounce tries", low=1, high=1024)
     vpls_slots: str = _knob("drawn", "which candidate gets a slot of a further bounce", choices=("drawn", "strongest"))
     ism_size: int = _knob(128, "texels an edge of an imperfect shadow map", low=8, high=2048)
     ism_points: int = _knob(1024, "points per map", low=1, high=2**20)

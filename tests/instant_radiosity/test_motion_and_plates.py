@@ -129,5 +129,5 @@ def test_integers_are_display_codes_and_floats_are_not(tmp_path):
     ):  # fmt: skip
         oiio.ImageBuf(image).write(str(tmp_path / name), kind)
         assert is_display_referred(tmp_path / name) == expected
-    with pytest.raises(FileError, match="none.png"):
+    with pytest.raises(FileError, match=r"none\.png"):
         is_display_referred(tmp_path / "none.png")

@@ -29,9 +29,9 @@ from warp_dvct.passes.point_cloud import SurfacePoints, sample_surfaces
 from warp_dvct.passes.resolve import resolve
 from warp_dvct.passes.shading import shade_direct
 from warp_dvct.passes.specular import find_glossy
+from warp_dvct.passes.vpl_bounces import bounce_vpls
 from warp_dvct.passes.vpl_shading import (
     VplLight,
-    bounce_vpls,
     light_picture,
     light_points,
     shade_direct_single,
@@ -192,7 +192,7 @@ class _Builder:
                 source,
                 self.ends[-1],
                 settings.vpls_further,
-                sources=settings.vpls_sources,
+                draws=settings.vpls_sources,
                 strongest=settings.vpls_slots == "strongest",
                 reach=self.region.reach,
                 seed=settings.seed + 7919 * bounce,

@@ -22,10 +22,15 @@ MOST_PIECES = 200_000
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """The two clouds. ``real`` and ``synthetic`` are ``kernels.ism.Cloud``; a count of 0 where there is no surface."""
+    """The two clouds, ``kernels.ism.Cloud``; a count of 0 where there is no surface.
+
+    ``real_order`` and ``synthetic_order`` list their points along a curve that keeps neighbours together.
+    """
 
     real: Any
     synthetic: Any
+    real_order: np.ndarray
+    synthetic_order: np.ndarray
 
 
 def sample_surfaces(
@@ -72,7 +77,7 @@ def sample_surfaces(
                 [cloud],
             )
         clouds.append(cloud)
-    return SurfacePoints(*clouds)
+    return SurfacePoints(*clouds, *(_curve(c.position.numpy()[: c.count].astype(np.float64)) for c in clouds))
 
 
 def _new_cloud(launcher: Launcher, count: int, block: int) -> Any:
@@ -111,7 +116,7 @@ class _HostDots:
         white = [np.ones((len(c.points), 3)) if c.colors is None else c.colors for c in scans]
         inside = np.linalg.norm(position - np.asarray(region.center), axis=-1) < region.radius
         chosen = np.flatnonzero(inside)
-        chosen = chosen[np.argsort(_morton(position[chosen]), kind="stable")]
+        chosen = chosen[_curve(position[chosen])]
         return _HostDots(
             position[chosen],
             joined([c.normals for c in scans], 3)[chosen],
@@ -129,15 +134,15 @@ class _HostDots:
         return dots
 
 
-def _morton(position: np.ndarray) -> np.ndarray:
-    """Places on the curve that visits a grid of 1024 cells an edge octant by octant."""
+def _curve(position: np.ndarray) -> np.ndarray:
+    """Order of points along Morton's curve, which visits a grid of 1024 cells an edge octant by octant."""
     if not len(position):
         return np.zeros(0, np.int64)
     low, extent = position.min(0), np.ptp(position, axis=0).max()
     cell = np.minimum((position - low) / max(extent, 1e-300) * 1024, 1023).astype(np.int64)
     for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
         cell = (cell | (cell << shift)) & mask
-    return cell @ np.array([1, 2, 4])
+    return np.argsort(cell @ np.array([1, 2, 4]), kind="stable")
 
 
 def _pieces(triangles: np.ndarray, first: int, dots: _HostDots, region: Region, *, thin: bool) -> _HostPieces | None:

@@ -9,15 +9,12 @@ import numpy as np
 import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
-from warp_dvct.kernels import vpl_bounces, vpl_shading
+from warp_dvct.kernels import vpl_shading
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.gbuffer import GBuffer, compact
-from warp_dvct.passes.point_cloud import SurfacePoints
-from warp_dvct.passes.vpls import LUMINANCE
 
 PLANE_TOLERANCE = 0.5  # distance off the tangent plane, in tiles, at which a neighbour counts 1/e
 NORMAL_SHARPNESS = 8.0  # exponent of the normals' cosine
-SYNTHETIC_SLOTS = 0.25  # share of the slots of a further bounce that synthetic surfaces get
 
 
 @dataclass(frozen=True)
@@ -161,59 +158,6 @@ def shade_glossy(
         ],
         [out, before],
     )
-
-
-def bounce_vpls(
-    launcher: Launcher,
-    scene: DeviceScene,
-    vpls: Any,
-    points: SurfacePoints,
-    sight: Any,
-    source: tuple[int, int],
-    start: int,
-    count: int,
-    *,
-    sources: int,
-    strongest: bool,
-    reach: float,
-    seed: int,
-) -> int:
-    """Make the VPLs of a further bounce in ``count`` slots from ``start`` on.
-
-    Every point of the clouds is a candidate for one slot: it draws ``sources`` VPLs of the bounce before in proportion
-    to their flux and asks ``sight`` whether they see it. One candidate gets the slot with the flux of all.
-
-    Args:
-        source: First and number of the VPLs of the bounce before.
-        strongest: The strongest candidate gets the slot, as in the paper; else one drawn in proportion to its flux,
-            which keeps the light's distribution.
-    Returns:
-        How many were made: 0 where the bounce before carries no light.
-    """
-    flux = vpls.flux.numpy()[source[0] : source[0] + source[1]] @ LUMINANCE
-    if not flux.sum() > 0.0:
-        return 0
-    cdf = np.concatenate([[0.0], np.cumsum(flux) / flux.sum()])
-    cdf[-1] = 1.0
-    synthetic = 0
-    if points.synthetic.count:
-        synthetic = count if not points.real.count else max(1, round(SYNTHETIC_SLOTS * count)) if count > 1 else 0
-    made = 0
-    for cloud, share in ((points.real, count - synthetic), (points.synthetic, synthetic)):
-        if share == 0:
-            continue
-        slots = vpl_bounces.Slots()
-        slots.source_first, slots.source_count = source
-        slots.start, slots.count = start + made, share
-        slots.sources, slots.strongest = sources, int(strongest)
-        slots.seed, slots.reach = seed, reach
-        launcher.launch(
-            vpl_bounces._bounce_vpls,
-            share,
-            [scene.geometry, cloud, sight, slots, launcher.array(cdf.astype(np.float32), wp.float32), vpls],
-        )
-        made += share
-    return made
 
 
 @dataclass(frozen=True)
