@@ -1,7 +1,12 @@
-"""A depth image as a triangle mesh: the grid of its pixels, cut at depth jumps."""
+"""A depth image as a triangle mesh: fine where the surface bends or ends, coarse where it is flat.
+
+Right-triangulated irregular network (Evans, Kirkpatrick and Townsend 2001): triangles are halved at the middle of their
+longest side until each such middle lies close enough. Errors are those of inverse depth, in which planes are exact.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,27 +14,27 @@ import numpy as np
 from warp_dvct.capture.intrinsics import Intrinsics
 from warp_dvct.scene import Mesh, Role
 
-# Corners of a quad of pixels in the order top left, top right, bottom left, bottom right; its two triangles, which run
-# counter-clockwise seen from the camera (whose v axis points down).
-TRIANGLES = ((0, 2, 1), (1, 2, 3))
+BLOCK = 32  # pixels an edge of the largest pair of triangles
 
 
 @dataclass(frozen=True)
 class GridLimits:
-    """When two neighbours of the grid are on one surface: their inverse depths differ by at most
-    ``(fixed + share * inverse depth) * stride``.
+    """When neighbours are on one surface, and how close triangles follow it.
+
+    Two neighbours are on one surface where their inverse depths differ by at most ``fixed + share * inverse depth``.
 
     Attributes:
         fixed: [1/m]. share: Of the nearer one's inverse depth.
+        tolerance: Of inverse depth [1/m].
     """
 
     fixed: float
     share: float
+    tolerance: float
 
-    def joined(self, a: np.ndarray, b: np.ndarray, stride: int) -> np.ndarray:
-        """Whether pixels with inverse depths ``a`` and ``b`` are, elementwise."""
-        near = np.maximum(a, b)
-        return (a > 0.0) & (b > 0.0) & (np.abs(a - b) <= (self.fixed + self.share * near) * stride)
+    def joined(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Whether neighbours with inverse depths ``a`` and ``b`` are on one surface, elementwise."""
+        return (a > 0.0) & (b > 0.0) & (np.abs(a - b) <= self.fixed + self.share * np.maximum(a, b))
 
 
 @dataclass(frozen=True)
@@ -37,10 +42,10 @@ class Grid:
     """Vertices and triangles in camera axes (OpenCV).
 
     Attributes:
-        points: float64 ``[v, 3]``. normals: float32 ``[v, 3]``, unit.
+        points: float64 ``[v, 3]``. normals: float32 ``[v, 3]``, unit, towards the camera.
         pixels: Pixel coordinates of each vertex, float64 ``[v, 2]``.
         source: Index into the image, row by row, of the pixel whose surface a vertex is on, ``[v]``.
-        triangles: int32 ``[t, 3]``.
+        triangles: int32 ``[t, 3]``, counter-clockwise seen from the camera.
     """
 
     points: np.ndarray
@@ -50,8 +55,8 @@ class Grid:
     triangles: np.ndarray
 
 
-def depth_grid(inverse: np.ndarray, normals: np.ndarray, lens: Intrinsics, limits: GridLimits, stride: int = 1) -> Grid:
-    """Join every ``stride``-th pixel to triangles.
+def depth_grid(inverse: np.ndarray, normals: np.ndarray, lens: Intrinsics, limits: GridLimits) -> Grid:
+    """Join pixels to triangles.
 
     At a depth jump the farther surface is continued to the nearer one's last vertices, so that from the camera no gap
     is seen between both. Pixels without depth leave holes.
@@ -60,53 +65,158 @@ def depth_grid(inverse: np.ndarray, normals: np.ndarray, lens: Intrinsics, limit
         inverse: 1 / depth [1/m], ``[h, w]``; 0 where nothing is known.
         normals: Unit normals towards the camera, ``[h, w, 3]``; 0 where there is none.
         lens: Without distortion.
-        limits: When neighbours are joined.
-        stride: Pixels between vertices.
+        limits: When pixels are joined, and how closely.
     """
-    rows = np.arange(0, lens.height, stride)
-    columns = np.arange(0, lens.width, stride)
-    rho = inverse[np.ix_(rows, columns)].astype(np.float64)
-    source = (rows[:, None] * lens.width + columns).astype(np.int64)
-    number = np.arange(rho.size).reshape(rho.shape)
-    quad = np.stack([number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]], -1).reshape(-1, 4)
-    corner = rho.ravel()[quad]
-    kept = []
-    for a, b, c in TRIANGLES:
-        joined = limits.joined(corner[:, a], corner[:, b], stride)
-        joined &= limits.joined(corner[:, b], corner[:, c], stride) & limits.joined(corner[:, a], corner[:, c], stride)
-        kept.append(joined)
-    triangles = [quad[joined][:, list(t)] for joined, t in zip(kept, TRIANGLES, strict=True)]
-    torn = ~(kept[0] & kept[1]) & (corner > 0.0).all(-1)
-    extra, extra_rho, extra_source = _continue_behind(quad[torn], corner[torn], source.ravel(), limits, stride)
-    if len(extra):
-        triangles += [(rho.size + extra)[:, list(t)] for t in TRIANGLES]
-    place = np.concatenate([source.ravel(), source.ravel()[quad[torn]].ravel()])
-    pixels = np.stack([place % lens.width, place // lens.width], -1).astype(np.float64)
-    owner = np.concatenate([source.ravel(), extra_source])
-    depth = np.concatenate([rho.ravel(), extra_rho])
-    faces = np.concatenate(triangles).astype(np.int32)
-    used, faces = np.unique(faces, return_inverse=True)
-    pixels, owner, depth = pixels[used], owner[used], depth[used]
+    rho = _padded(inverse)
+    width = rho.shape[1]
+    corners = _refined(rho, _errors(rho, limits) > limits.tolerance)
+    number = corners[..., 1] * width + corners[..., 0]
+    flat = rho.ravel()
+    whole = (flat[number] > 0.0).all(-1)
+    unit = np.ptp(corners, axis=1).max(-1) == 1
+    number, unit = number[whole], unit[whole]
+    number = number[~unit | _one_surface(flat[number], limits)]
+    extra, extra_place, extra_rho, extra_owner = _continued(rho, limits)
+    triangles = np.concatenate([number, rho.size + extra])
+    # Only what a triangle uses becomes a vertex.
+    used, triangles = np.unique(triangles, return_inverse=True)
+    place = np.concatenate([np.arange(rho.size), extra_place])[used]
+    owner = np.concatenate([np.arange(rho.size), extra_owner])[used]
+    depth = np.concatenate([flat, extra_rho])[used]
+    pixels = np.stack([place % width, place // width], -1).astype(np.float64)
+    source = np.minimum(owner // width, lens.height - 1) * lens.width + np.minimum(owner % width, lens.width - 1)
     rays = np.stack([(pixels[:, 0] - lens.cx) / lens.fx, (pixels[:, 1] - lens.cy) / lens.fy, np.ones(len(pixels))], -1)
-    points = rays / depth[:, None]
-    normal = normals.reshape(-1, 3)[owner]
+    normal = normals.reshape(-1, 3)[source].astype(np.float64)
     missing = np.linalg.norm(normal, axis=-1) < 0.5
     normal[missing] = -(rays / np.linalg.norm(rays, axis=-1, keepdims=True))[missing]
-    return Grid(points, normal.astype(np.float32), pixels, owner, faces.reshape(-1, 3).astype(np.int32))
+    return Grid(
+        rays / depth[:, None], normal.astype(np.float32), pixels, source, triangles.reshape(-1, 3).astype(np.int32)
+    )
 
 
-def _continue_behind(
-    quad: np.ndarray, corner: np.ndarray, source: np.ndarray, limits: GridLimits, stride: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Four vertices for each torn quad on its farthest surface: indices ``[q, 4]``, inverse depths, and pixels whose
-    surface they are on, flat."""
-    count = len(quad)
+def _padded(inverse: np.ndarray) -> np.ndarray:
+    """The image with unknown pixels at its right and bottom, so that it is whole blocks and one pixel."""
+    height, width = inverse.shape
+    down, right = -(height - 1) % BLOCK, -(width - 1) % BLOCK
+    return np.pad(inverse.astype(np.float64), ((0, down), (0, right)))
+
+
+def _levels() -> Iterator[int]:
+    """Half edges of cells, from the finest: 1, 2, 4 ... BLOCK / 2."""
+    half = 1
+    while half < BLOCK:
+        yield half
+        half *= 2
+
+
+def _errors(rho: np.ndarray, limits: GridLimits) -> np.ndarray:
+    """How far each pixel, as the middle of a longest side, or any pixel in the triangles that it splits, is off."""
+    margin = BLOCK
+    error = np.zeros((rho.shape[0] + 2 * margin, rho.shape[1] + 2 * margin))
+
+    def at(first_y: int, first_x: int, step: int, count: tuple[int, ...]) -> np.ndarray:
+        y, x = first_y + margin, first_x + margin
+        return error[y : y + step * count[0] : step, x : x + step * count[1] : step]
+
+    for half in _levels():
+        step, quarter = 2 * half, half // 2
+        corner = rho[::step, ::step]
+        for middle, a, b, y, x in (
+            (rho[::step, half::step], corner[:, :-1], corner[:, 1:], 0, half),
+            (rho[half::step, ::step], corner[:-1], corner[1:], half, 0),
+        ):
+            found = _middle_error(a, middle, b, half, limits)
+            if quarter:
+                for dy, dx in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+                    found = np.maximum(found, at(y + dy * quarter, x + dx * quarter, step, found.shape))
+            at(y, x, step, found.shape)[:] = found
+        middle = rho[half::step, half::step]
+        falling = _falling(middle.shape)
+        a = np.where(falling, corner[:-1, :-1], corner[:-1, 1:])
+        b = np.where(falling, corner[1:, 1:], corner[1:, :-1])
+        found = _middle_error(a, middle, b, half, limits)
+        if half == 1:
+            for side in (rho[::2, 1::2][:-1], rho[::2, 1::2][1:], rho[1::2, ::2][:, :-1], rho[1::2, ::2][:, 1:]):
+                torn = ~limits.joined(side, middle) & ((side > 0.0) | (middle > 0.0))
+                found[torn] = np.inf
+        for dy, dx in ((-half, 0), (half, 0), (0, -half), (0, half)):
+            found = np.maximum(found, at(half + dy, half + dx, step, found.shape))
+        at(half, half, step, found.shape)[:] = found
+    return error[margin:-margin, margin:-margin]
+
+
+def _middle_error(a: np.ndarray, middle: np.ndarray, b: np.ndarray, half: int, limits: GridLimits) -> np.ndarray:
+    """Of a middle between the ends of a side; infinite where one of the three is unknown or, for neighbours, apart."""
+    known = (a > 0.0).astype(np.int8) + (middle > 0.0) + (b > 0.0)
+    error = np.where(known == 3, np.abs(0.5 * (a + b) - middle), np.where(known == 0, 0.0, np.inf))
+    if half == 1:
+        error[(known == 3) & ~(limits.joined(a, middle) & limits.joined(middle, b))] = np.inf
+    return error
+
+
+def _falling(shape: tuple[int, ...]) -> np.ndarray:
+    """Which cells are split from top left to bottom right: every other one."""
+    y, x = np.indices(shape)
+    return (x + y) % 2 == 0
+
+
+def _refined(rho: np.ndarray, split: np.ndarray) -> np.ndarray:
+    """Halve the triangles of all blocks at the middles that ask for it: pixels ``[t, 3, 2]`` as (x, y)."""
+    rows, columns = (rho.shape[0] - 1) // BLOCK, (rho.shape[1] - 1) // BLOCK
+    y, x = np.indices((rows, columns)) * BLOCK
+    corner = np.stack([np.stack([x + dx * BLOCK, y + dy * BLOCK], -1) for dy in (0, 1) for dx in (0, 1)], -2)
+    falling = _falling((rows, columns))[..., None]
+    # The longest side's ends, then the corner across from it; counter-clockwise where y points down.
+    first = np.where(falling, [0, 3, 1], [2, 1, 0])
+    second = np.where(falling, [3, 0, 2], [1, 2, 3])
+    chosen = [np.take_along_axis(corner, t[..., None], -2).reshape(-1, 3, 2) for t in (first, second)]
+    triangles = np.concatenate(chosen)
+    done = []
+    while len(triangles):
+        a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+        middle = (a + b) // 2
+        # A side of one pixel, or the diagonal of one, has no pixel in its middle.
+        halved = (np.abs(a - b).max(-1) > 1) & split[middle[:, 1], middle[:, 0]]
+        done.append(triangles[~halved])
+        a, b, c, middle = a[halved], b[halved], c[halved], middle[halved]
+        triangles = np.concatenate([np.stack([c, a, middle], 1), np.stack([b, c, middle], 1)])
+    return np.concatenate(done)
+
+
+def _one_surface(corner: np.ndarray, limits: GridLimits) -> np.ndarray:
+    """Whether the three corners ``[t, 3]`` are neighbours on one surface."""
+    joined = [limits.joined(corner[:, i], corner[:, j]) for i, j in ((0, 1), (1, 2), (2, 0))]
+    return joined[0] & joined[1] & joined[2]
+
+
+def _continued(rho: np.ndarray, limits: GridLimits) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles that continue the farther surface below the nearer one's edge.
+
+    Returns:
+        Triangles ``[t, 3]`` over new vertices, and of these the pixel, the inverse depth, and the pixel whose surface
+        they are on.
+    """
+    number = np.arange(rho.size).reshape(rho.shape)
+    quad = np.stack([number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]], -1)
+    falling = _falling(quad.shape[:2])
+    known = rho > 0.0
+    known = known[:-1, :-1] & known[:-1, 1:] & known[1:, :-1] & known[1:, 1:]
+    quad, falling = quad[known], falling[known]
+    corner = rho.ravel()[quad]
     far = corner.min(-1, keepdims=True)
-    on_far = limits.joined(corner, np.broadcast_to(far, corner.shape), stride)
+    torn = ~limits.joined(corner, np.broadcast_to(far, corner.shape)).all(-1)
+    quad, falling, corner, far = quad[torn], falling[torn], corner[torn], far[torn]
+    on_far = limits.joined(corner, np.broadcast_to(far, corner.shape))
     mean = (corner * on_far).sum(-1, keepdims=True) / np.maximum(on_far.sum(-1, keepdims=True), 1)
-    rho = np.where(on_far, corner, mean)
-    owner = np.where(on_far, source[quad], source[np.take_along_axis(quad, corner.argmin(-1)[:, None], 1)])
-    return np.arange(4 * count).reshape(count, 4), rho.ravel(), owner.ravel()
+    farthest = np.take_along_axis(quad, corner.argmin(-1)[:, None], 1)
+    new = np.arange(4 * len(quad)).reshape(len(quad), 4)
+    triangles = []
+    for fall, rise in (([0, 3, 1], [1, 0, 2]), ([3, 0, 2], [2, 3, 1])):
+        chosen = np.where(falling[:, None], fall, rise)
+        whole = _one_surface(np.take_along_axis(corner, chosen, 1), limits)
+        triangles.append(np.take_along_axis(new, chosen, 1)[~whole])
+    rho_new, owner = np.where(on_far, corner, mean), np.where(on_far, quad, farthest)
+    return np.concatenate(triangles), quad.ravel(), rho_new.ravel(), owner.ravel()
 
 
 def grid_mesh(grid: Grid, pose: np.ndarray, material: int, uvs: np.ndarray | None, path: str) -> Mesh:

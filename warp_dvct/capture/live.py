@@ -39,19 +39,19 @@ class LiveOptions:
     """How live depth becomes the real scene.
 
     Attributes:
-        stride: Pixels of the depth image between vertices.
+        tolerance: How far triangles may be off the filtered depth, in the filter's ``noise`` of inverse depth.
         surroundings: Whether what no depth image shows sends light: a dome of the photographs' mean colour, unless the
             stage has a dome. Without it, it is black.
         filter: Of the depth.
     """
 
-    stride: int = 2
+    tolerance: float = 0.3
     surroundings: bool = True
     filter: FilterOptions = field(default_factory=FilterOptions)
 
     def __post_init__(self) -> None:
-        if self.stride < 1:
-            raise OptionError(f"a stride of {self.stride}: give at least 1 pixel between vertices")
+        if not self.tolerance > 0.0:
+            raise OptionError(f"a tolerance of {self.tolerance}: give a positive share of the noise")
 
 
 class LiveSource:
@@ -210,9 +210,9 @@ class LiveSource:
 
     def _grid(self, filtered: FilteredDepth) -> Grid:
         options = self._options.filter
-        limits = GridLimits(options.edge * options.noise, options.edge_share)
+        limits = GridLimits(options.edge * options.noise, options.edge_share, self._options.tolerance * options.noise)
         inverse = filtered.inverse.numpy().reshape(filtered.height, filtered.width)
-        return depth_grid(inverse, filtered.normals(), self.capture.rig.depth, limits, self._options.stride)
+        return depth_grid(inverse, filtered.normals(), self.capture.rig.depth, limits)
 
 
 def _view(capture: Capture, index: int, pose: np.ndarray, *, has_color: bool) -> Camera:
