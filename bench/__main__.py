@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from warp_dvct.bench.check_commands import CHECK_COMMANDS
 from warp_dvct.bench.options import settings_of, shared, write_json
 from warp_dvct.bench.trade_commands import TRADE_COMMANDS
 from warp_dvct.cli.quiet import start_warp
@@ -225,7 +226,7 @@ def motion(stage: str, pairs: tuple[str, ...], json_file: Path | None, spp: int,
         write_json(json_file, {"options": asdict(options), "report": asdict(report)})
 
 
-for _command in TRADE_COMMANDS:
+for _command in (*TRADE_COMMANDS, *CHECK_COMMANDS):
     bench.add_command(_command)
 
 
