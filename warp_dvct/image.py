@@ -27,7 +27,7 @@ def write_exr(
     """Write a frame as one half-float ZIP EXR with ``layer.channel`` names.
 
     ``R G B A`` is the synthetic part, premultiplied; ``comp plate shadow added delta albedo`` have ``.R .G .B``, ``N``
-    and ``P`` have ``.X .Y .Z``; ``depth.Z``, ``mask_real`` and ``mask_synthetic`` are single. ``P`` and ``depth.Z`` are
+    and ``P`` have ``.X .Y .Z``; ``depth.Z``, ``mask_real``, ``mask_synthetic`` and, of captures, ``holes`` are single. ``P`` and ``depth.Z`` are
     32-bit. The header says ``software`` and, of the camera, ``camera`` (its prim path) and ``worldToCamera`` (for row
     vectors as OpenEXR defines it; the camera looks along -z).
 
@@ -94,6 +94,8 @@ def exr_channels(layers: Layers) -> dict[str, np.ndarray]:
     channels["depth.Z"] = np.ascontiguousarray(layers.depth, np.float32)
     for name in ("mask_real", "mask_synthetic"):
         channels[name] = _to_half(getattr(layers, name))
+    if layers.holes is not None:
+        channels["holes"] = _to_half(layers.holes)
     return channels
 
 

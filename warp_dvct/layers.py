@@ -54,6 +54,8 @@ class Layers:
         albedo, normal, position: ``[h, w, 3]``; position in metres, world space.
         depth: ``[h, w]``, metres along the view axis; inf where nothing is seen.
         mask_real, mask_synthetic: ``[h, w]``, coverage in [0, 1].
+        holes: ``[h, w]``, the share of the pixel in which a capture knows no real surface, so that the plate is kept;
+            None where the real scene comes from no capture.
         clamped: Channel values that half precision cannot hold and that were clamped to +-65504.
         invalid: NaN channel values that were set to 0.
     """
@@ -70,5 +72,6 @@ class Layers:
     depth: np.ndarray
     mask_real: np.ndarray
     mask_synthetic: np.ndarray
+    holes: np.ndarray | None = None
     clamped: int = 0
     invalid: int = 0

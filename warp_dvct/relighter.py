@@ -189,6 +189,9 @@ class Relighter:
         report("composite", 0.95)
         with launcher.scope("composite"):
             layers = composite(launcher, radiance, plate)
+        if self.scene.captured:
+            unknown = np.clip(1.0 - layers.mask_real - layers.mask_synthetic, 0.0, 1.0)
+            layers = replace(layers, holes=unknown)
         spent, spent_cpu = clock.perf_counter() - start, clock.process_time() - start_cpu
         report("done", 1.0)
         self.stats = {

@@ -225,7 +225,11 @@ class Notice:
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything that a picture needs, at one time code."""
+    """Everything that a picture needs, at one time code.
+
+    Attributes:
+        captured: The real scene is what a depth camera saw: pixels without real surface are holes, not background.
+    """
 
     meshes: tuple[Mesh, ...]
     materials: tuple[Material, ...]
@@ -235,6 +239,7 @@ class Scene:
     plate: str | None = None
     notices: tuple[Notice, ...] = ()
     point_clouds: tuple[PointCloud, ...] = ()
+    captured: bool = False
 
     def bounds(self, role: Role | None = None) -> tuple[np.ndarray, np.ndarray] | None:
         """Axis-aligned bounds (low, high) in metres of the geometry of a role, or of all; None where there is none."""

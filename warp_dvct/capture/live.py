@@ -158,6 +158,7 @@ class LiveSource:
             point_clouds=clouds,
             lights=lights,
             notices=(*scene.notices, *notices),
+            captured=True,
         )
 
     def filtered(self, time: float | None = None) -> FilteredDepth:
