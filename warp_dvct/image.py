@@ -26,13 +26,14 @@ def write_exr(
 ) -> None:
     """Write a frame as one half-float ZIP EXR with ``layer.channel`` names.
 
-    ``R G B A`` is the synthetic part, premultiplied; ``comp plate shadow added delta albedo`` have ``.R .G .B``, ``N``
-    and ``P`` have ``.X .Y .Z``; ``depth.Z``, ``mask_real``, ``mask_synthetic`` and, of captures, ``holes`` are single. ``P`` and ``depth.Z`` are
-    32-bit. The header says ``software`` and, of the camera, ``camera`` (its prim path) and ``worldToCamera`` (for row
-    vectors as OpenEXR defines it; the camera looks along -z).
+     ``R G B A`` is the synthetic part, premultiplied; ``comp plate shadow added delta albedo`` have ``.R .G .B``, ``N``
+     and ``P`` have ``.X .Y .Z``; ``depth.Z``, ``mask_real``, ``mask_synthetic`` and, of captures, ``holes`` are single.
+    ``P`` and ``depth.Z`` are
+     32-bit. The header says ``software`` and, of the camera, ``camera`` (its prim path) and ``worldToCamera`` (for row
+     vectors as OpenEXR defines it; the camera looks along -z).
 
-    Raises:
-        FileError: The file cannot be written; nothing is left behind.
+     Raises:
+         FileError: The file cannot be written; nothing is left behind.
     """
     import OpenEXR
 

@@ -14,6 +14,7 @@ import numpy as np
 from warp_dvct.capture.intrinsics import Intrinsics
 from warp_dvct.scene import Mesh, Role
 
+OUTER = 0.51  # pixels by which the surface goes on past the outermost pixels' centres: to the image's edge
 BLOCK = 32  # pixels an edge of the largest pair of triangles
 
 
@@ -84,6 +85,8 @@ def depth_grid(inverse: np.ndarray, normals: np.ndarray, lens: Intrinsics, limit
     owner = np.concatenate([np.arange(rho.size), extra_owner])[used]
     depth = np.concatenate([flat, extra_rho])[used]
     pixels = np.stack([place % width, place // width], -1).astype(np.float64)
+    edge = np.array(lens.size) - 1
+    pixels += np.where(pixels == 0, -OUTER, np.where(pixels == edge, OUTER, 0.0))
     source = np.minimum(owner // width, lens.height - 1) * lens.width + np.minimum(owner % width, lens.width - 1)
     rays = np.stack([(pixels[:, 0] - lens.cx) / lens.fx, (pixels[:, 1] - lens.cy) / lens.fy, np.ones(len(pixels))], -1)
     normal = normals.reshape(-1, 3)[source].astype(np.float64)
