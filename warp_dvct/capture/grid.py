@@ -27,11 +27,14 @@ class GridLimits:
     Attributes:
         fixed: [1/m]. share: Of the nearer one's inverse depth.
         tolerance: Of inverse depth [1/m].
+        slide: Pixels by which what is interpolated over a triangle (a texture's coordinates) may be off: linear in
+            space is not linear in the picture where depth changes.
     """
 
     fixed: float
     share: float
     tolerance: float
+    slide: float = 0.5
 
     def joined(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Whether neighbours with inverse depths ``a`` and ``b`` are on one surface, elementwise."""
@@ -70,7 +73,7 @@ def depth_grid(inverse: np.ndarray, normals: np.ndarray, lens: Intrinsics, limit
     """
     rho = _padded(inverse)
     width = rho.shape[1]
-    corners = _refined(rho, _errors(rho, limits) > limits.tolerance)
+    corners = _refined(rho, _errors(rho, limits) > 1.0)
     number = corners[..., 1] * width + corners[..., 0]
     flat = rho.ravel()
     whole = (flat[number] > 0.0).all(-1)
@@ -113,7 +116,8 @@ def _levels() -> Iterator[int]:
 
 
 def _errors(rho: np.ndarray, limits: GridLimits) -> np.ndarray:
-    """How far each pixel, as the middle of a longest side, or any pixel in the triangles that it splits, is off."""
+    """How far each pixel, as the middle of a longest side, or any pixel in the triangles that it splits, is off, in
+    what is tolerated."""
     margin = BLOCK
     error = np.zeros((rho.shape[0] + 2 * margin, rho.shape[1] + 2 * margin))
 
@@ -128,7 +132,7 @@ def _errors(rho: np.ndarray, limits: GridLimits) -> np.ndarray:
             (rho[::step, half::step], corner[:, :-1], corner[:, 1:], 0, half),
             (rho[half::step, ::step], corner[:-1], corner[1:], half, 0),
         ):
-            found = _middle_error(a, middle, b, half, limits)
+            found = _middle_error(a, middle, b, half, half, limits)
             if quarter:
                 for dy, dx in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
                     found = np.maximum(found, at(y + dy * quarter, x + dx * quarter, step, found.shape))
@@ -137,7 +141,7 @@ def _errors(rho: np.ndarray, limits: GridLimits) -> np.ndarray:
         falling = _falling(middle.shape)
         a = np.where(falling, corner[:-1, :-1], corner[:-1, 1:])
         b = np.where(falling, corner[1:, 1:], corner[1:, :-1])
-        found = _middle_error(a, middle, b, half, limits)
+        found = _middle_error(a, middle, b, half, half * np.sqrt(2.0), limits)
         if half == 1:
             for side in (rho[::2, 1::2][:-1], rho[::2, 1::2][1:], rho[1::2, ::2][:, :-1], rho[1::2, ::2][:, 1:]):
                 torn = ~limits.joined(side, middle) & ((side > 0.0) | (middle > 0.0))
@@ -148,10 +152,19 @@ def _errors(rho: np.ndarray, limits: GridLimits) -> np.ndarray:
     return error[margin:-margin, margin:-margin]
 
 
-def _middle_error(a: np.ndarray, middle: np.ndarray, b: np.ndarray, half: int, limits: GridLimits) -> np.ndarray:
-    """Of a middle between the ends of a side; infinite where one of the three is unknown or, for neighbours, apart."""
+def _middle_error(
+    a: np.ndarray, middle: np.ndarray, b: np.ndarray, half: int, reach: float, limits: GridLimits
+) -> np.ndarray:
+    """Of a middle between the ends of a side, in what is tolerated; infinite where one of the three is unknown or, for
+    neighbours, apart.
+
+    Args:
+        reach: Pixels from the middle to the ends. In space the middle lies at the share (1 / a) / (1 / a + 1 / b).
+    """
     known = (a > 0.0).astype(np.int8) + (middle > 0.0) + (b > 0.0)
-    error = np.where(known == 3, np.abs(0.5 * (a + b) - middle), np.where(known == 0, 0.0, np.inf))
+    slide = reach * np.abs(a - b) / np.maximum(a + b, 1e-12)
+    error = np.maximum(np.abs(0.5 * (a + b) - middle) / limits.tolerance, slide / limits.slide)
+    error = np.where(known == 3, error, np.where(known == 0, 0.0, np.inf))
     if half == 1:
         error[(known == 3) & ~(limits.joined(a, middle) & limits.joined(middle, b))] = np.inf
     return error
