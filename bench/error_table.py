@@ -1,8 +1,8 @@
 """The table of errors that ``relight --budget`` predicts from, fitted to the rows of ``bench tradeoff``.
 
 Squared FLIP (less that of the truth's noise) of a sweep's point over that of the stage's base point, which has the
-balanced preset's settings at the truth's bounces, gives what a value of a knob costs; means over the stages of a class
-are tabulated. The base itself is a power law in the share of the picture that the objects change.
+balanced preset's settings at the truth's bounces, gives what a value of a knob costs; geometric means over the stages of
+a class are tabulated. The base itself is a power law in how much the objects change the picture, found by the survey.
 """
 
 from __future__ import annotations
@@ -102,9 +102,9 @@ def _excess(
         alone = changed <= moved if knob != "bounces" else not changed
         if alone and (knob == "bounces" or settings.bounces == 8):
             value = float(getattr(settings, NAMES[knob]))
-            found.setdefault(value, []).append((flip / base[stage]) ** 2 - 1.0)
+            found.setdefault(value, []).append(2.0 * math.log(max(flip, LEAST) / base[stage]))
     values = sorted(found)
-    means = np.array([float(np.mean(found[v])) for v in values])
+    means = np.array([math.expm1(float(np.mean(found[v]))) for v in values])
     falling = _falling(means if knob != "gather.stride" else means[::-1])
     falling = falling if knob != "gather.stride" else falling[::-1]
     return [[v, round(float(e), 4)] for v, e in zip(values, falling, strict=True)]
@@ -124,10 +124,10 @@ def _falling(values: np.ndarray) -> np.ndarray:
 def _power_law(
     base: Mapping[str, float], surveys: Mapping[str, Survey], points: Mapping[Any, float], main: int
 ) -> dict[str, float]:
-    """Log FLIP = constant of the class + power * log(affected share) + power * log(width / 320)."""
+    """Log FLIP = constant of the class + power * log(mean change over mean picture) + power * log(width / 320)."""
     stages = list(base)
     columns = [[float(kind_of(surveys[s]) == k) for s in stages] for k in ("diffuse", "glossy")]
-    columns.append([math.log(max(surveys[s].affected, 1e-3)) for s in stages])
+    columns.append([math.log(max(surveys[s].affected * surveys[s].change, 1e-3)) for s in stages])
     matrix, values = np.array(columns).T, np.log([base[s] for s in stages])
     # A little pull towards no dependence keeps the power sensible where there are few stages.
     pull = np.array([[0.0, 0.0, 0.3]])
@@ -142,7 +142,7 @@ def _power_law(
     return {
         "diffuse": float(found[0]) + shift,
         "glossy": (float(found[1]) if any(columns[1]) else float(found[0])) + shift,
-        "affected": float(found[2]),
+        "change": float(found[2]),
         "width": slope,
     }
 

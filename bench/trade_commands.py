@@ -183,6 +183,52 @@ def error_table(files: tuple[Path, ...], out: Path | None) -> None:
         module.write_table(table, out)
 
 
+@click.command()
+@click.option("--effect", "effects", multiple=True, help="One of them; repeatable. Default: all.")
+@click.option("--quality", type=click.Choice(QUALITIES), default="balanced", show_default=True)
+@click.option("--width", type=int, default=320, show_default=True, help="Pixels across; the height follows the camera.")
+@click.option("--spp", "samples", type=int, default=128, show_default=True, help="Samples per pixel of the truth.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Of the truth's random numbers.")
+@click.option("--cache", type=FILE, help="References; default: warp_dvct in the user's cache.")
+@click.option("--images", type=FILE, metavar="DIR", help="Write pictures of the known failures there.")
+@click.option("--device", default="cpu", show_default=True, help="cpu or cuda:N.")
+@click.option("--threads", type=int, help="CPU threads; all cores by default.")
+@click.option("--out", type=FILE, metavar="FILE", help="Add the rows to this file of JSON lines.")
+def effects(cache: Path | None, out: Path | None, **rest: Any) -> None:
+    """Shadows, bounces, reflections, skies, thin walls, small objects: each method's error and cost, as a table."""
+    start_warp(rest["device"])
+    from warp_dvct.bench import effects as module
+    from warp_dvct.bench.rows import append_row, provenance, read_rows
+
+    if out is not None:
+        read_rows(out)
+    options = module.EffectOptions(cache=cache or cache_folder() / "references", **rest)
+    rows = module.measure(
+        options, lambda r: click.echo(f"{r['effect']}, {r['method']}: {100 * r['error']:.3g} %", err=True)
+    )
+    click.echo(module.format_table(rows))
+    if out is not None:
+        taken = provenance()
+        for row in rows:
+            append_row(out, {**row, **taken})
+
+
+@click.command()
+@click.argument("file", type=FILE)
+@click.option("--width", type=int, default=240, show_default=True, help="Pixels across of each panel.")
+@click.option("--device", default="cpu", show_default=True, help="cpu or cuda:N.")
+@click.option("--threads", type=int, help="CPU threads; all cores by default.")
+def figure3(file: Path, width: int, device: str, threads: int | None) -> None:
+    """The paper's figure 3 from our own renders, into FILE (.png or .jpg): where the delta formulation is wrong."""
+    start_warp(device)
+    from warp_dvct.bench import figure3 as module
+    from warp_dvct.launch import Launcher
+
+    made = module.panels(Launcher(device, threads), width=width)
+    module.draw(made, file)
+    click.echo(module.format_panels(made))
+
+
 def repeat_command() -> str:
     """The command line that is being run, with what differs from the defaults."""
     context = click.get_current_context()
@@ -209,4 +255,4 @@ def _some_rows(file: Path, kind: str) -> list[dict[str, Any]]:
     return rows
 
 
-TRADE_COMMANDS = (backends, tradeoff, scaling, budget, error_table)
+TRADE_COMMANDS = (backends, tradeoff, scaling, budget, error_table, effects, figure3)

@@ -80,10 +80,10 @@ class Accuracy:
     spread: float
 
     def balanced(self, survey: Survey, width: int) -> float:
-        """FLIP of the balanced preset: a power of the affected share, by class, and of the picture's width."""
-        share = max(survey.affected, 1e-3)
+        """FLIP of the balanced preset: by class, powers of the mean change of the picture and of its width."""
+        size = max(survey.affected * survey.change, 1e-3)
         power = self.base["width"] * math.log(width / 320.0)
-        return math.exp(self.base[kind_of(survey)] + self.base["affected"] * math.log(share) + power)
+        return math.exp(self.base[kind_of(survey)] + self.base["change"] * math.log(size) + power)
 
     def error(self, settings: Settings, survey: Survey, width: int) -> float:
         """Mean LDR-FLIP of the picture against many bounces."""
@@ -219,11 +219,20 @@ class _Chooser:
         self.survey, self.model, self.accuracy = survey, model, accuracy
         self.width, self.height, self.threads, self.fixed = width, height, threads, fixed
         self.base = make_settings("balanced", fixed)
-        self.ladders = [
-            x for x in LADDERS if _matters(x.knob, survey) and not any(k in fixed for k in x.settings(x.values[0]))
-        ]
         self.required = math.ceil(VOXELS_PER_FEATURE / survey.feature) if survey.feature > 0.0 else 0
+        self.ladders = [
+            self._required(x)
+            for x in LADDERS
+            if _matters(x.knob, survey) and not any(k in fixed for k in x.settings(x.values[0]))
+        ]
         self.planning = {"survey": {"frame": 1.0, "triangles": survey.triangles * 1e-6}}
+
+    def _required(self, ladder: Ladder) -> Ladder:
+        """Without voxels that are too large for the objects: no error that the table knows shows that."""
+        if ladder.knob != "volume.resolution":
+            return ladder
+        enough = tuple(v for v in ladder.values if v >= self.required)
+        return replace(ladder, values=enough or ladder.values[-1:])
 
     def settings(self, state: Mapping[str, int]) -> Settings:
         """Of a state, over what is fixed."""
