@@ -36,7 +36,12 @@ class Settings:
         2.0, "edge of the fine volume over the synthetic bounding box's largest", low=1.0, high=1e3
     )
     volume_coarse: int = _knob(128, "voxels an edge of the volume around the fine one; 0 for none", low=0, high=1024)
-    volume_reach: float = _knob(16.0, "largest edge of the coarse volume, in edges of the fine one", low=1.0, high=1e4)
+    volume_reach: float = _knob(
+        16.0,
+        "largest edge of the coarse volume, in edges of the fine one; doubled where walls would be left out",
+        low=1.0,
+        high=1e4,
+    )
 
     rsm_texels: int = _knob(1024, "most texels an edge of a reflective shadow map", low=1, high=8192)
     rsm_density: float = _knob(1.0, "texels per voxel edge at the volume's far side", low=0.01, high=16.0)
