@@ -21,7 +21,16 @@ import warp as wp
 from warp_dvct.capture.albedo import CLIPPED, thinned, unit
 from warp_dvct.capture.fusion import FusedMesh
 from warp_dvct.capture.irradiance import Lighting, Receivers, real_scene
-from warp_dvct.capture.light_solver import HIGH, LOW, SAME, Solver, color_clusters, fibonacci_sphere, harmonics_of
+from warp_dvct.capture.light_solver import (
+    HIGH,
+    LOW,
+    MOST_BOUNCED,
+    SAME,
+    Solver,
+    color_clusters,
+    fibonacci_sphere,
+    harmonics_of,
+)
 from warp_dvct.device_scene import DeviceScene, upload_lights
 from warp_dvct.errors import OptionError
 from warp_dvct.kernels import light_fit as kernels
@@ -31,7 +40,8 @@ from warp_dvct.scene import Light, LightKind
 
 POINTS = 4000  # surface points that the fit looks at
 RAYS = 128  # per point into the dome
-TRIED = 512  # directions among which the dominant one is looked for
+TRIED = 1024  # directions among which the dominant one is looked for
+LOWEST = 0.1  # sine of the least elevation at which it is looked for: lamps and the sun are above
 SEARCHES, ROUNDS = 6, 6  # of light and albedo in turns, with the direction looked for, then refined
 # Logarithm of chromaticity between colours that have albedos of their own, and weight of lightness beside it: finer as
 # the light becomes known.
@@ -39,6 +49,7 @@ GROUPINGS = ((0.6, 0.0), (0.4, 0.0), (SAME, 0.0), (SAME, 0.5))
 TURNS = 2  # of the fit and the light that bounces
 DARKEST = 0.004  # linear; darker pixels are the sensor's noise
 LEAST = 100  # surface points
+ILL_CONDITIONED = 100.0  # condition number beyond which errors of 1 % in the shading undo a part of the light
 FILLS = np.linspace(0.0, 2.0, 41)  # brightness of what was not seen over that of what was, that is tried
 DOME_HEIGHT = 32  # texels of the dome's image; harmonics of degree 2 need no more
 SUN_ANGLE = np.radians(2.0)  # of the dominant light's disc: a guess, shading alone does not tell
@@ -53,8 +64,9 @@ class LightFit:
         harmonics: Radiance of the dome, real spherical harmonics of degree 0 to 2, RGB, ``[9, 3]``.
         toward: Unit direction to the dominant light. irradiance: On a plane that faces it, RGB.
         singular_values: Of the Jacobian of the shading by 9 harmonics, strength and direction of the dominant light,
-            each column scaled to unit length; descending, ``[12]``. condition: First over last of them.
-        spread: Standard deviation of the direction [rad], from the residual.
+            each column scaled to unit length; descending, ``[12]``, or ``[10]`` where no light is dominant.
+        condition: First over last of them.
+        spread: Standard deviation of the direction [rad], from the residual; pi where no light is dominant.
         residual: Root mean square of what the fit leaves, relative to the shading.
         open: Mean share of directions that are not blocked by the surface itself.
         points: Number of surface points used.
@@ -69,6 +81,10 @@ class LightFit:
     residual: float
     open: float
     points: int
+
+    def describe(self) -> tuple[str, ...]:
+        """What a user should know of it."""
+        return _noted(self)
 
     def probe(self) -> ProbeLights:
         """The dome as an image, and the dominant light as its peak."""
@@ -98,6 +114,27 @@ class LightFit:
         return (Light(LightKind.DOME, (1.0, 1.0, 1.0), texture=probe.dome, path="/Lights/Dome"), *suns)
 
 
+def _noted(fit: LightFit) -> tuple[str, ...]:
+    """What a user should know of an estimate."""
+    share = float((fit.irradiance @ LUMINANCE) / max(fit.irradiance @ LUMINANCE + _dome_level(fit), 1e-12))
+    x, y, z = fit.toward
+    source = "no light dominates"
+    if fit.irradiance.any():
+        angle = np.degrees(fit.spread)
+        source = f"{share:.0%} comes from ({x:.2f} {y:.2f} {z:.2f}), known to about {angle:.1f} degrees"
+    verdict = ": ill-conditioned, parts of the light are guesses" if fit.condition > ILL_CONDITIONED else ""
+    values = " ".join(f"{v:.2g}" for v in fit.singular_values)
+    return (
+        f"light estimated at {fit.points} points: {source}; the shading is explained to {fit.residual:.0%}",
+        f"condition number {fit.condition:.0f}, singular values {values}{verdict}",
+    )
+
+
+def _dome_level(fit: LightFit) -> float:
+    """Mean irradiance of the dome on planes that face all ways, luminance."""
+    return float(np.pi * 0.28209479 * (fit.harmonics[0] @ LUMINANCE))
+
+
 def fit_light(launcher: Launcher, mesh: FusedMesh, *, voxel: float, seed: int = 0) -> LightFit:
     """Estimate the light of a scanned place from its vertex colours.
 
@@ -107,23 +144,28 @@ def fit_light(launcher: Launcher, mesh: FusedMesh, *, voxel: float, seed: int = 
     Raises:
         OptionError: No colours, too few usable points, or a surface so closed that no outside light enters.
     """
-    at, seen, index = _samples(mesh, voxel, seed)
+    at, seen, index = _samples(mesh, voxel, seed, clipped=True)
     model = ShadingModel(launcher, mesh, at, seed)
     if model.open < LEAST_OPEN:
         raise OptionError(
             f"only {model.open:.1%} of the directions above the surface are open: no light from outside reaches it, so"
             " none can be estimated; give the lamps inside by --probe LIGHTS.usda"
         )
-    solver = Solver(seen, model.dome, model.light, seed)
+    solver = Solver(seen, model.dome, model.light, clipped=(seen >= CLIPPED).any(-1), seed=seed)
     tried = fibonacci_sphere(TRIED)
+    tried = tried[tried[:, 1] > LOWEST]
     columns = model.try_directions(tried)
     for _ in range(SEARCHES):
         solver.start_from(tried, columns)
         solver.step(turn=False)
-    for turn in range(TURNS + 1):
-        _alternate(solver)
-        if turn < TURNS:
-            solver.bounced = _bounced(launcher, mesh, at, index, solver, model)
+    for apart, lightness in GROUPINGS:
+        solver.regroup(apart, lightness)
+        for _ in range(ROUNDS):
+            solver.step()
+    for _ in range(TURNS):
+        solver.bounced = _bounced(launcher, mesh, at, index, solver, model)
+        for _ in range(ROUNDS):
+            solver.step()
     return _result(solver, model)
 
 
@@ -174,19 +216,16 @@ def _unevenness(seen: np.ndarray, total: np.ndarray, cluster: np.ndarray) -> flo
     return float(sum(np.abs(log[cluster == k] - np.median(log[cluster == k])).sum() for k in np.unique(cluster)))
 
 
-def _alternate(solver: Solver) -> None:
-    """Light and albedo in turns, with colours told apart ever more finely."""
-    for apart, lightness in GROUPINGS:
-        solver.regroup(apart, lightness)
-        for _ in range(ROUNDS):
-            solver.step()
-
-
-def _samples(mesh: FusedMesh, voxel: float, seed: int) -> tuple[Receivers, np.ndarray, np.ndarray]:
-    """Surface points that are neither clipped nor black, the radiance that was seen there, and their vertices."""
+def _samples(
+    mesh: FusedMesh, voxel: float, seed: int, *, clipped: bool = False
+) -> tuple[Receivers, np.ndarray, np.ndarray]:
+    """Surface points that are not black, the radiance that was seen there, and their vertices. Clipped ones are left
+    out, or they are taken as they are."""
     if mesh.colors is None:
         raise OptionError("the capture has no photographs, so its light cannot be estimated; give --probe LIGHTS.usda")
-    usable = (mesh.colors < CLIPPED).all(-1) & (mesh.colors.max(-1) > DARKEST)
+    usable = mesh.colors.max(-1) > DARKEST
+    if not clipped:
+        usable &= (mesh.colors < CLIPPED).all(-1)
     index = np.flatnonzero(usable)
     if len(index) < LEAST:
         raise OptionError(
@@ -287,18 +326,22 @@ def _spread_albedo(mesh: FusedMesh, index: np.ndarray, cluster: np.ndarray, albe
 def _bounced(
     launcher: Launcher, mesh: FusedMesh, at: Receivers, index: np.ndarray, solver: Solver, model: ShadingModel
 ) -> np.ndarray:
-    """Irradiance that bounced off the surface under the light as it is estimated now, ``[n, 3]``."""
+    """Share of the irradiance that bounced off the surface under the light as it is estimated now, ``[n, 3]``."""
     fit = _result(solver, model)
     gathered = Lighting(
         launcher, mesh, _spread_albedo(mesh, index, solver.cluster, solver.x.albedo), fit.lights()
     ).gathered(at)
-    return np.maximum(gathered - np.maximum(model.dome @ solver.x.harmonics, 0.0), 0.0)
+    direct = np.maximum(model.dome @ solver.x.harmonics, 0.0)
+    bounced = np.maximum(gathered - direct, 0.0)
+    direct = direct + model.light(solver.x.toward)[0][:, None] * solver.x.irradiance
+    return np.clip(bounced / np.maximum(bounced + direct, 1e-9), 0.0, MOST_BOUNCED)
 
 
 def _result(solver: Solver, model: ShadingModel) -> LightFit:
     jacobian = solver.jacobian()
-    size = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
-    values = np.linalg.svd(jacobian / size, compute_uv=False)
+    if not solver.x.irradiance.any():
+        jacobian = jacobian[:, :-2]  # no dominant light, so none that could turn
+    values = np.linalg.svd(jacobian / np.linalg.norm(jacobian, axis=0), compute_uv=False)
     residual = solver.residual()
     covariance = np.linalg.pinv(jacobian.T @ jacobian) * residual**2
     return LightFit(
@@ -307,7 +350,7 @@ def _result(solver: Solver, model: ShadingModel) -> LightFit:
         irradiance=solver.x.irradiance,
         singular_values=values,
         condition=float(values[0] / max(values[-1], 1e-12)),
-        spread=float(np.sqrt(max(covariance[-2, -2] + covariance[-1, -1], 0.0))),
+        spread=float(np.sqrt(max(covariance[-2, -2] + covariance[-1, -1], 0.0))) if len(values) > 10 else np.pi,
         residual=residual,
         open=model.open,
         points=model.count,

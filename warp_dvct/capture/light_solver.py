@@ -25,6 +25,8 @@ HALVINGS = 5  # of a step that does not help
 TUKEY = 4.685 * 1.4826  # of the median absolute residual: the usual 95 % efficiency
 LEAST_SCALE = 1.0  # of the shading: a shadow that the light does not explain yet is what moves it
 
+MOST_BOUNCED = 0.9
+
 # Irradiance of a distant light of unit irradiance toward a direction, [n], and its derivative by that, [n, 3].
 Sun = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -50,15 +52,20 @@ class Solver:
     Args:
         seen: Radiance in the photographs, positive, ``[n, 3]``.
         dome: Irradiance by each harmonic of the dome, ``[n, h]``.
+        clipped: Samples that may have been any brighter, ``[n]``.
         sun: The dominant light's irradiance.
         seed: Of the clusters' start.
 
     Attributes:
-        bounced: Irradiance that bounced off other surfaces, ``[n, 3]``, to be set from outside.
+        bounced: Share of the irradiance that bounced off other surfaces, in [0, MOST_BOUNCED], ``[n, 3]``, to be set
+            from outside. As a share it follows the light, and the fit cannot run away from it.
     """
 
-    def __init__(self, seen: np.ndarray, dome: np.ndarray, sun: Sun, seed: int = 0) -> None:
+    def __init__(
+        self, seen: np.ndarray, dome: np.ndarray, sun: Sun, *, clipped: np.ndarray | None = None, seed: int = 0
+    ) -> None:
         self.seen, self.dome, self.sun, self.seed = seen, dome, sun, seed
+        self.clipped = np.zeros(len(seen), bool) if clipped is None else clipped
         self.cluster = np.zeros(len(seen), np.int64)
         self.bounced = np.zeros_like(seen)
         self.weight = np.ones(len(seen))
@@ -68,7 +75,7 @@ class Solver:
     def predicted(self) -> np.ndarray:
         """Irradiance ``[n, 3]`` of the current estimate."""
         sun = self.sun(self.x.toward)[0][:, None] * self.x.irradiance
-        return self.bounced + self.dome @ self.x.harmonics + sun
+        return np.maximum(self.dome @ self.x.harmonics + sun, 0.0) / (1.0 - self.bounced)
 
     def regroup(self, apart: float, lightness: float = 0.0) -> None:
         """Find anew which samples share an albedo, by the colour that is left when the estimated light is divided out.
@@ -122,17 +129,22 @@ class Solver:
         error = self._relative_error()
         return float(np.sqrt((self.weight * error**2).sum() / self.weight.sum()))
 
-    def _target(self) -> tuple[np.ndarray, np.ndarray]:
-        """Irradiance that is to be explained, and the weight of each row: errors of shading are relative."""
+    def _whole(self) -> np.ndarray:
+        """Irradiance that the photographs ask for, ``[n, 3]``; clipped ones ask for no less than that."""
         whole = np.pi * self.seen / self.x.albedo
-        return whole - self.bounced, np.sqrt(self.weight) / np.maximum(whole @ LUMINANCE, 1e-9)
+        return np.where(self.clipped[:, None], np.maximum(whole, self.predicted()), whole)
+
+    def _target(self) -> tuple[np.ndarray, np.ndarray]:
+        """Irradiance that is to come from the light directly, and the weight of each row: errors are relative."""
+        whole = self._whole()
+        return whole * (1.0 - self.bounced), np.sqrt(self.weight) / np.maximum(whole @ LUMINANCE, 1e-9)
 
     def _quotient(self) -> np.ndarray:
         predicted = self.predicted()
         return np.pi * self.seen / np.maximum(predicted, 1e-3 * predicted.mean())
 
     def _relative_error(self) -> np.ndarray:
-        whole = np.pi * self.seen / self.x.albedo
+        whole = self._whole()
         return ((self.predicted() - whole) @ LUMINANCE) / np.maximum(whole @ LUMINANCE, 1e-9)
 
     def _turn(self, gradient: np.ndarray, row: np.ndarray) -> None:
@@ -162,7 +174,7 @@ class Solver:
         """Each cluster's median."""
         for k in np.unique(self.cluster):
             mine = self.cluster == k
-            trusted = mine & (self.weight > 0.1)
+            trusted = mine & (self.weight > 0.1) & ~self.clipped
             self.x.albedo[mine] = np.median(quotient[trusted if trusted.any() else mine], axis=0)
 
     def _normalize(self) -> None:
@@ -173,7 +185,6 @@ class Solver:
         factor = factor * lightest / LIGHTEST
         self.x.albedo = np.clip(self.x.albedo / factor, LOW, HIGH)
         self.x.harmonics, self.x.irradiance = self.x.harmonics * factor, self.x.irradiance * factor
-        self.bounced = self.bounced * factor
 
 
 def nonnegative_light(matrix: np.ndarray, target: np.ndarray, harmonics: int) -> np.ndarray:

@@ -15,7 +15,8 @@ from warp_dvct.capture.intrinsics import FLIP
 from warp_dvct.capture.overlay import overlay, relative, save
 from warp_dvct.capture.stage import Capture, Placement
 from warp_dvct.errors import OptionError, StageError
-from warp_dvct.image import replacing, write_text
+from warp_dvct.image import replacing, write_radiance, write_text
+from warp_dvct.probe import ProbeLights, lights_usda
 from warp_dvct.usd.stage import open_stage, quiet_diagnostics, world_frame
 
 if TYPE_CHECKING:
@@ -26,18 +27,19 @@ GREY = (0.18, 0.18, 0.18)  # of a mesh that no frame has colour for; UsdPreviewS
 
 @dataclass(frozen=True)
 class SceneLights:
-    """Lights of the real scene in the world (metres, y up).
+    """Lights of the real scene to be authored beside its mesh.
 
     Attributes:
-        layer: Text of a USD layer with default prim; None where ``file`` is given.
-        file: An existing layer or stage, which is referenced.
-        doc: What they are, for readers of the stage.
+        file: A layer or stage with a default prim, which is referenced; None for none.
+        estimated: Lights that were fitted, written as a layer of their own; None for none.
+        fill: Radiance of what the scan has not seen, RGB ``[3]``; None for none.
+        facts: Numbers and lists of numbers kept as ``customData``: how well-conditioned the estimate is.
     """
 
-    layer: str | None = None
     file: str | None = None
-    doc: str = ""
-    data: dict[str, float | str | Sequence[float]] = field(default_factory=dict)
+    estimated: ProbeLights | None = None
+    fill: np.ndarray | None = None
+    facts: dict[str, Any] = field(default_factory=dict)
 
 
 def mesh_file(target: Path) -> Path:
@@ -66,7 +68,7 @@ def write_scene(
     Args:
         path: ``.usda`` or ``.usdc``, another file than the capture.
         mesh: In the capture stage's world.
-        lights: The real scene's lights; None for those that the capture has.
+        lights: The real scene's lights, beside those that the capture has.
         poses: Depth camera (OpenCV axes) to the stage's world of every frame, where tracking found others than the
             capture's; None for a lost frame.
         facts: Kept as ``customData`` of the mesh, as what it was made with.
@@ -81,8 +83,10 @@ def write_scene(
         raise StageError(f"{capture.depth_path} of '{capture.path}' has no prim above it; put it below an Xform")
     with quiet_diagnostics():
         _write_mesh(mesh_file(target), mesh, np.linalg.inv(capture.world))
-    if lights is not None and lights.layer is not None:
-        write_text(lights_file(target), lights.layer)
+    if lights is not None and lights.estimated is not None:
+        texture = lights_file(target).with_suffix(".exr")
+        write_radiance(texture, lights.estimated.dome)
+        write_text(lights_file(target), lights_usda(lights.estimated, texture.name, os.path.basename(capture.path)))
     with overlay(capture.path, target) as stage:
         _author_mesh(stage, root, mesh_file(target).name, mesh, facts or {})
         if poses is not None:
@@ -175,18 +179,25 @@ def _author_poses(stage: Usd.Stage, capture: Capture, poses: Sequence[np.ndarray
 
 def _author_lights(stage: Usd.Stage, root: str, target: Path, lights: SceneLights, to_local: np.ndarray) -> None:
     """Reference the lights, turned from their own axes and units into those of the prim above them."""
-    from pxr import Gf, UsdGeom
+    from pxr import Gf, UsdGeom, UsdLux, Vt
 
-    file = lights_file(target) if lights.file is None else Path(os.path.abspath(lights.file))
-    source = open_stage(file)
-    if not source.GetDefaultPrim():
-        raise StageError(f"'{file}' has no default prim, so it cannot be referenced as lights; author defaultPrim")
-    _, to_world = world_frame(source)
     group = UsdGeom.Xform.Define(stage, f"{root}/Lights")
-    group.AddTransformOp().Set(Gf.Matrix4d((to_world @ to_local.T).tolist()))
-    if lights.doc:
-        group.GetPrim().SetDocumentation(lights.doc)
-    for key, value in lights.data.items():
-        group.GetPrim().SetCustomDataByKey(f"dvct:{key}", value)
-    inner = stage.DefinePrim(f"{root}/Lights/Real")
-    inner.GetReferences().AddReference(relative(str(file), target.parent))
+    file = lights_file(target) if lights.estimated is not None else lights.file
+    frame = np.eye(4)
+    if file is not None:
+        source = open_stage(file)
+        if not source.GetDefaultPrim():
+            raise StageError(f"'{file}' has no default prim, so it cannot be referenced as lights; author defaultPrim")
+        frame = world_frame(source)[1]
+        inner = stage.DefinePrim(f"{root}/Lights/Known")
+        inner.GetReferences().AddReference(relative(file, target.parent))
+    group.AddTransformOp().Set(Gf.Matrix4d((frame @ to_local.T).tolist()))
+    for key, value in lights.facts.items():
+        plain = Vt.DoubleArray(value) if isinstance(value, list) else value
+        group.GetPrim().SetCustomDataByKey(f"dvct:{key}", plain)
+    if lights.fill is not None and lights.fill.any():
+        fill = UsdLux.DomeLight.Define(stage, f"{root}/Lights/Unseen")
+        level = float(lights.fill.max())
+        fill.CreateIntensityAttr(level)
+        fill.CreateColorAttr(Gf.Vec3f(*(lights.fill / level).tolist()))
+        fill.GetPrim().SetDocumentation("Stands for the parts of the room that no frame has seen.")

@@ -7,6 +7,7 @@ import os
 import click
 
 from warp_dvct.cli.progress import Progress
+from warp_dvct.cli.quiet import start_warp
 from warp_dvct.image import check_writable
 
 SKIPPED_SHOWN = 10
@@ -44,6 +45,23 @@ SKIPPED_SHOWN = 10
 @click.option("--close-holes", type=click.FloatRange(0.0), default=0.0, metavar="METRES", help="Up to that radius.")
 @click.option("--triangles", type=click.IntRange(min=4), metavar="N", help="Decimate the mesh to that many.")
 @click.option("--probe", metavar="FILE", help="Lights of the real scene, as `warp-dvct probe` writes them.")
+@click.option(
+    "--estimate-light",
+    is_flag=True,
+    help="Fit a dome and one direction to the shading. The default without --probe where the capture has no lights.",
+)
+@click.option("--no-light", is_flag=True, help="Author no light; albedo is the camera's colour.")
+@click.option(
+    "--albedo",
+    type=click.Choice(["irradiance", "color"]),
+    default="irradiance",
+    show_default=True,
+    help="Photographs over the light that fell on the surface, or the camera's colour as it is.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of every random number.")
+@click.option(
+    "--device", default="cpu", show_default=True, metavar="DEVICE", help="Of light and albedo: cpu or cuda:N."
+)
 @click.option("--camera", metavar="PATH", help="Depth camera; needed where the stage has several.")
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="CPU threads. Default: all cores.")
 def reconstruct(
@@ -59,6 +77,11 @@ def reconstruct(
     close_holes: float,
     triangles: int | None,
     probe: str | None,
+    estimate_light: bool,
+    no_light: bool,
+    albedo: str,
+    seed: int,
+    device: str,
     camera: str | None,
     threads: int | None,
 ) -> None:
@@ -66,12 +89,16 @@ def reconstruct(
     if not output.lower().endswith((".usda", ".usd", ".usdc")):
         raise click.UsageError(f"OUTPUT is '{output}'; its name must end in .usda, .usd or .usdc")
     check_writable(output)
-    from warp_dvct.capture.fusion import FusionOptions, fuse
-    from warp_dvct.capture.scene_stage import SceneLights, write_scene
+    if no_light and (probe or estimate_light):
+        raise click.UsageError("--no-light goes with neither --probe nor --estimate-light")
+    start_warp(device)
+    from warp_dvct.capture.fusion import FusionOptions
+    from warp_dvct.capture.reconstruct import ReconstructOptions
+    from warp_dvct.capture.reconstruct import reconstruct as run
     from warp_dvct.capture.source import CaptureFrames
     from warp_dvct.capture.stage import open_capture
 
-    options = FusionOptions(
+    fusion = FusionOptions(
         voxel=voxel,
         truncation=truncation,
         near=near,
@@ -82,11 +109,21 @@ def reconstruct(
         close_holes=close_holes,
         triangles=triangles,
     )
+    options = ReconstructOptions(fusion, albedo, probe, estimate_light, not no_light, seed)
     opened = open_capture(capture, camera=camera)
     with Progress(os.path.basename(output)) as progress:
-        mesh = fuse(CaptureFrames(opened), options, threads=threads, progress=progress.update)
-    lights = None if probe is None else SceneLights(file=probe)
-    write_scene(output, opened, mesh, lights=lights, facts={"voxel": voxel})
+        made = run(
+            opened,
+            CaptureFrames(opened),
+            output,
+            options,
+            device=device,
+            threads=threads,
+            progress=progress.update,
+        )
+    mesh = made.mesh
+    for note in made.notes:
+        click.echo(f"warp-dvct: {note}", err=True)
     _report_skipped(mesh.skipped, len(opened))
     click.echo(
         f"{output}: {len(mesh.triangles)} triangles from {mesh.frames} of {len(opened)} frames;"
