@@ -1,8 +1,9 @@
 """The table of errors that ``relight --budget`` predicts from, fitted to the rows of ``bench tradeoff``.
 
 Squared FLIP (less that of the truth's noise) of a sweep's point over that of the stage's base point, which has the
-balanced preset's settings at the truth's bounces, gives what a value of a knob costs; geometric means over the stages of
-a class are tabulated. The base itself is a power law in how much the objects change the picture, found by the survey.
+balanced preset's settings at the truth's bounces, gives what a value of a knob costs; the table holds its geometric
+mean over the stages of a class. The base itself is a power law in how much the objects change the picture, found by the
+survey.
 """
 
 from __future__ import annotations
