@@ -48,7 +48,7 @@ def measure_all(launcher: Any) -> list[Deviation]:
     from warp_dvct.bench.twins import direct, indirect, pictures, surfaces, volumes, vpls
 
     found: list[Deviation] = []
-    measures: list[Callable[[Any], list[Deviation]]] = [
+    measures: list[Callable[[Any], Any]] = [
         *(surfaces.measure_gbuffer, direct.measure_rsm, direct.measure_direct),
         *(direct.measure_path_tracing, volumes.measure_voxels, volumes.measure_injection, volumes.measure_pyramid),
         *(indirect.measure_cones, indirect.measure_rays, indirect.measure_specular, indirect.measure_bounces),

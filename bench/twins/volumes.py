@@ -122,7 +122,8 @@ def inject_one(out: np.ndarray, area: np.ndarray, maps: ShadowMaps, name: str, s
         cell = np.clip(cell, 0, N - 1)
         shown = (share * area[tuple(cell.T)][..., solution]).sum(-1) > 0.0
         here = left & inside & shown
-        np.add.at(out, (*cell[here].T, slice(None), solution), share[here, :, None] * flux[here, None] * N**2)
+        at: Any = (*cell[here].T, slice(None), solution)
+        np.add.at(out, at, share[here, :, None] * flux[here, None] * N**2)
         left &= ~here
 
 
