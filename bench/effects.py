@@ -195,7 +195,7 @@ def _prepare(effect: Effect, options: EffectOptions, launcher: Launcher) -> _Sta
     delta = smooth_delta(0.5 * (one.delta + two.delta), cover)
     direct = delta
     if effect.bounces:
-        direct = smooth_delta(0.5 * sum(s.get(0).delta for s in stores), cover)
+        direct = smooth_delta(np.mean([s.get(0).delta for s in stores], 0), cover)
     masks = region_masks(direct, delta, cover, stores[0].glossy_mask())
     masks["changed"] = (cover <= 0) & (np.abs(delta).max(-1) > 0.01)
     if not masks[effect.region].any():
