@@ -256,6 +256,8 @@ def test_the_shipped_table_orders_values(surveys):
 def test_models_are_kept_by_machine(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     assert load_model("cpu").shipped
+    with pytest.raises(OptionError, match=r"calibrate --device cuda:0"):
+        load_model("cuda:0")
     save_model(made_model(), model_file("cpu"))
     assert load_model("cpu") == made_model()
     assert model_file("cpu") != model_file("cuda:0")

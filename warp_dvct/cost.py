@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_dvct.errors import FileError
+from warp_dvct.errors import FileError, OptionError
 from warp_dvct.image import write_text
 from warp_dvct.settings import Settings
 from warp_dvct.survey import Survey
@@ -260,15 +260,20 @@ def model_file(device: str) -> Path:
 
 
 def load_model(device: str) -> CostModel:
-    """This machine's model, or the shipped one where it was never calibrated.
+    """This machine's model, or the shipped one for its processor where it was never calibrated.
 
     Raises:
+        OptionError: A GPU was never calibrated: GPUs differ too much for a shipped model.
         FileError: The file is there and is no model; the message says how to make a new one.
     """
     file = model_file(device)
     try:
         text = file.read_text(encoding="utf-8")
-    except FileNotFoundError:
+    except FileNotFoundError as error:
+        if device != "cpu":
+            raise OptionError(
+                f"what a frame costs on {device} is not known; run `warp-dvct calibrate --device {device}` once"
+            ) from error
         return _parse(DEFAULT_FILE.read_text(encoding="utf-8"), DEFAULT_FILE, shipped=True)
     except OSError as error:
         raise FileError(f"{file} cannot be read: {error.strerror or error}") from error
