@@ -44,6 +44,14 @@ SKIPPED_SHOWN = 10
 )
 @click.option("--close-holes", type=click.FloatRange(0.0), default=0.0, metavar="METRES", help="Up to that radius.")
 @click.option("--triangles", type=click.IntRange(min=4), metavar="N", help="Decimate the mesh to that many.")
+@click.option(
+    "--track",
+    type=click.Choice(["odometry", "model"]),
+    help="Find poses anew: each frame from the one before, or from the surface fused so far.",
+)
+@click.option("--markers", is_flag=True, help="Find poses anew by square markers of --marker-size.")
+@click.option("--marker-size", type=click.FloatRange(0.0, min_open=True), metavar="METRES", help="Edge of their black.")
+@click.option("--dictionary", default="DICT_4X4_50", show_default=True, help="Of the markers, as OpenCV names it.")
 @click.option("--probe", metavar="FILE", help="Lights of the real scene, as `warp-dvct probe` writes them.")
 @click.option(
     "--estimate-light",
@@ -76,6 +84,10 @@ def reconstruct(
     least_area: float | None,
     close_holes: float,
     triangles: int | None,
+    track: str | None,
+    markers: bool,
+    marker_size: float | None,
+    dictionary: str,
     probe: str | None,
     estimate_light: bool,
     no_light: bool,
@@ -91,12 +103,17 @@ def reconstruct(
     check_writable(output)
     if no_light and (probe or estimate_light):
         raise click.UsageError("--no-light goes with neither --probe nor --estimate-light")
+    if markers and (track or marker_size is None):
+        raise click.UsageError("--markers needs --marker-size, and goes without --track")
     start_warp(device)
+    from warp_dvct.capture.frames import Skipped
     from warp_dvct.capture.fusion import FusionOptions
+    from warp_dvct.capture.markers import track_by_markers
     from warp_dvct.capture.reconstruct import ReconstructOptions
     from warp_dvct.capture.reconstruct import reconstruct as run
     from warp_dvct.capture.source import CaptureFrames
     from warp_dvct.capture.stage import open_capture
+    from warp_dvct.capture.tracking import track_capture
 
     fusion = FusionOptions(
         voxel=voxel,
@@ -111,12 +128,23 @@ def reconstruct(
     )
     options = ReconstructOptions(fusion, albedo, probe, estimate_light, not no_light, seed)
     opened = open_capture(capture, camera=camera)
+    poses, skipped = None, Skipped()
+    if track or markers:
+        with Progress(f"{os.path.basename(output)}: tracking") as progress:
+            if marker_size is not None and markers:
+                found = track_by_markers(opened, marker_size, dictionary, progress=progress.update)
+            else:
+                assert track is not None
+                found = track_capture(opened, track, fusion, threads=threads, progress=progress.update)
+        poses, skipped.reasons = found.poses, dict(found.lost)
     with Progress(os.path.basename(output)) as progress:
         made = run(
             opened,
-            CaptureFrames(opened),
+            CaptureFrames(opened, poses),
             output,
             options,
+            poses=poses,
+            skipped=skipped,
             device=device,
             threads=threads,
             progress=progress.update,
