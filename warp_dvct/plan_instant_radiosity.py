@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from warp_dvct.passes.ism import map_texels
+from warp_dvct.passes.vpl_memory import CLOUD_BYTES, VPL_BYTES, map_texels, vpl_count
 from warp_dvct.plan import MAP_BYTES, POINT_BYTES, PassPlan
 from warp_dvct.scene import LightKind, Scene
 from warp_dvct.settings import Settings
-
-VPL_BYTES = 52
-CLOUD_BYTES = 48
 
 
 def plan_passes(
@@ -29,7 +26,7 @@ def plan_passes(
     further = max(0, settings.bounces - 1)
     sky = settings.vpls_sky if dome else 0
     first = settings.vpls_count if settings.bounces else 0
-    count = sky + first + further * settings.vpls_further
+    count = vpl_count(settings, dome=dome)
     needs_vpls = lit and count > 0
     no_vpls = idle if not lit else "bounces=0 and no dome: direct light only"
     maps = needs_vpls and settings.visibility == "ism"

@@ -13,6 +13,7 @@ from warp_dvct.device_scene import DeviceScene, camera_frame
 from warp_dvct.errors import DeviceError
 from warp_dvct.methods.instant_radiosity import first_vpls, lit_region, make_vpls
 from warp_dvct.methods.path_tracing import gather_irradiance_reference
+from warp_dvct.passes import vpl_memory
 from warp_dvct.passes.gbuffer import render_gbuffer
 from warp_dvct.passes.ism import draw_isms, new_isms, ray_sight
 from warp_dvct.passes.point_cloud import sample_surfaces
@@ -320,6 +321,37 @@ def test_maps_that_do_not_fit_are_refused(launcher):
     setup = Setup(launcher, scene_of(LIGHTS["spot"]))
     with pytest.raises(DeviceError, match=r"500000 VPLs at ism.size=2048 need .* VPLs would fit: lower vpls.count"):
         new_isms(launcher, 500_000, size=2048, bias=0.1, region=setup.region)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"vpls.count": 131072, "ism.size": 512},
+            r"131328 VPLs at ism.size=512 need .* MiB are free; \d+ VPLs would fit",
+        ),
+        ({"bounces": 64, "vpls.further": 131072}, r"imperfect shadow maps of 8257792 VPLs .* or take visibility=ray"),
+        ({"ism.points": 1048576, "ism.blocks": 4096}, r"ism.blocks=4096 sets of ism.points=1048576 .*; \d+ would fit"),
+        ({"ism.points": 1048576, "ism.blocks": 2048, "visibility": "ray"}, r"ism.blocks=2048 .* would fit"),
+    ],
+)
+def test_more_than_memory_holds_is_refused_before_anything_is_made(settings, message):
+    relighter = Relighter(
+        scene_of(LIGHTS["spot"]), method="instant-radiosity", width=8, height=8, settings={"bounces": 2, **settings}
+    )
+    with pytest.raises(DeviceError, match=message):
+        relighter.render()
+    assert relighter._launcher.peak_bytes < 2**20  # the scene alone was uploaded
+
+
+def test_maps_of_many_lights_that_do_not_fit_are_refused(launcher, monkeypatch):
+    monkeypatch.setattr(vpl_memory, "free_bytes", lambda launcher: 2**30)
+    with pytest.raises(DeviceError, match=r"maps of 9 light\(s\) at vpls.map=4096 need 18432 MiB .*; 965 would fit"):
+        vpl_memory.check_memory(launcher, make_settings("balanced", {"vpls.map": 4096}), lights=9, dome=False)
+    rays = make_settings("balanced", {"visibility": "ray", "bounces": 64, "vpls.further": 2**17})
+    monkeypatch.setattr(vpl_memory, "free_bytes", lambda launcher: 2**28)
+    with pytest.raises(DeviceError, match=r"8257792 VPLs .*: lower the largest, virtual point lights"):
+        vpl_memory.check_memory(launcher, rays, lights=1, dome=False)
 
 
 def test_share_out():

@@ -30,6 +30,7 @@ from warp_dvct.passes.resolve import resolve
 from warp_dvct.passes.shading import shade_direct
 from warp_dvct.passes.specular import find_glossy
 from warp_dvct.passes.vpl_bounces import bounce_vpls
+from warp_dvct.passes.vpl_memory import check_memory
 from warp_dvct.passes.vpl_shading import (
     VplLight,
     light_picture,
@@ -68,6 +69,7 @@ class VplSet:
 def make_vpls(launcher: Launcher, scene: Scene, device_scene: DeviceScene, plan: Plan) -> VplSet:
     """Place VPLs on the sky, on what the lights light, and on what those light (sections 3.3, 3.6 and 3.7)."""
     settings = plan.settings
+    check_memory(launcher, settings, lights=len(scene.lights), dome=has_dome(scene.lights))
     region = lit_region(scene, device_scene, plan)
     env = build_environment(launcher, scene.lights)
     sky = settings.vpls_sky if env.levels else 0
