@@ -17,6 +17,7 @@ from warp_dvct.errors import CheckError
 
 UNWRITTEN = np.float32(3.0e38)  # finite; anything computed from it soon is not
 INF = float("inf")
+ALBEDO_FIT = 3.5e-3  # kernels/materials.py fits the share of light that a surface reflects, with errors up to 0.0032
 SLACK = 1.0e-3  # by which rounding may carry a unit vector or a share out of its range
 
 # Ranges by the name of an output array (or of a field of an output struct), for all kernels or for one; others have to
@@ -26,7 +27,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "mask_real": (0.0, 1.0 + SLACK),
     "shadow": (0.0, 1.0),
     "added": (0.0, 65504.0),
-    "albedo": (0.0, 1.0 + SLACK),
+    "albedo": (0.0, 1.0 + ALBEDO_FIT),
     "base_color": (0.0, INF),
     "normal": (-1.0 - SLACK, 1.0 + SLACK),
     "normal_g": (-1.0 - SLACK, 1.0 + SLACK),
