@@ -25,11 +25,13 @@ ERROR_FACTOR = 1.5  # between predicted and measured error
 
 @dataclass(frozen=True)
 class BudgetOptions:
-    """What is measured; the fields are the command's flags. ``samples`` are of the truth; 0 measures no error."""
+    """What is measured; the fields are the command's flags. ``samples`` are of the truth; 0 measures no error. Of
+    ``repeats`` the least times count: on a busy machine they are nearer to what the frame takes."""
 
     budgets: tuple[float, ...] = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
     width: int = 320
     samples: int = 96
+    repeats: int = 1
     method: str = "delta-cones"
     settings: dict[str, str] = field(default_factory=dict)
     seed: int = 1
@@ -41,13 +43,13 @@ class BudgetOptions:
 def measure(
     stage: str, options: BudgetOptions, report: Callable[[dict[str, Any]], None] = lambda row: None
 ) -> list[dict[str, Any]]:
-    """A row per budget: one frame with a plate after a small warm-up; budgets below the floor say so.
+    """A row per budget: a frame with a plate after a small warm-up; budgets below the floor say so.
 
     Raises:
-        OptionError: No budget, or as the relighter raises.
+        OptionError: No budget, no repeat, or as the relighter raises.
     """
-    if not options.budgets:
-        raise OptionError("there is no budget to keep; give --budget SECONDS")
+    if not options.budgets or options.repeats < 1:
+        raise OptionError("there is no budget to keep; give --budget SECONDS, and --repeats of at least 1")
     from warp_dvct.relighter import Relighter
 
     scene = read(stage_file(stage))
@@ -73,34 +75,40 @@ def measure(
     rows = []
     for budget in options.budgets:
         row: dict[str, Any] = {"kind": KIND, "stage": Path(stage).stem, "width": options.width, "height": height}
-        relighter = Relighter(scene, method=options.method, settings=options.settings, **size)
-        start, cpu = time.perf_counter(), time.process_time()
         try:
-            choice = relighter.keep_budget(budget, has_plate=True)
+            tries = [_keep(scene, budget, plate, options, size) for _ in range(options.repeats)]
         except OptionError as error:
             rows.append({**row, "budget": budget, "refused": str(error)})
             report(rows[-1])
             continue
-        planning, planning_cpu = time.perf_counter() - start, time.process_time() - cpu
-        comp = relighter.render(plate).comp
+        best = min(tries, key=lambda t: t["cpu_seconds"])
+        comp = best.pop("comp")
         flip = None
         if truth is not None:
             flip = math.sqrt(max(flip_ldr(truth.comp, comp)[0] ** 2 - truth.noise**2, 0.0))
-        rows.append(
-            {
-                **row,
-                "budget": budget,
-                "threads": relighter._launcher.threads,
-                "predicted": choice.to_dict(),
-                "seconds": planning + relighter.stats["render_seconds"],
-                "cpu_seconds": planning_cpu + relighter.stats["cpu_seconds"],
-                "passes": relighter.stats["passes"],
-                "cpu_passes": relighter.stats["cpu_passes"],
-                "flip": flip,
-            }
-        )
+        rows.append({**row, "budget": budget, **best, "seconds": min(t["seconds"] for t in tries), "flip": flip})
         report(rows[-1])
     return rows
+
+
+def _keep(scene: Any, budget: float, plate: np.ndarray, options: BudgetOptions, size: dict[str, Any]) -> dict[str, Any]:
+    """Choose, render, and say what both took."""
+    from warp_dvct.relighter import Relighter
+
+    relighter = Relighter(scene, method=options.method, settings=options.settings, **size)
+    start, cpu = time.perf_counter(), time.process_time()
+    choice = relighter.keep_budget(budget, has_plate=True)
+    planning, planning_cpu = time.perf_counter() - start, time.process_time() - cpu
+    comp = relighter.render(plate).comp
+    stats = relighter.stats
+    return {
+        "predicted": choice.to_dict(),
+        "seconds": planning + stats["render_seconds"],
+        "cpu_seconds": planning_cpu + stats["cpu_seconds"],
+        "passes": stats["passes"],
+        "cpu_passes": stats["cpu_passes"],
+        "comp": comp,
+    }
 
 
 HEAD = (

@@ -105,6 +105,7 @@ def tradeoff(stages: tuple[str, ...], cache: Path | None, html: Path | None, **r
 @click.option(
     "--budget", "budgets", type=float, multiple=True, default=(0.5, 1, 2, 5, 10, 20), show_default=True, help="Seconds."
 )
+@click.option("--repeats", type=int, default=1, show_default=True, help="Of which the least times count.")
 @click.option("--method", type=click.Choice(("delta-cones", "path-trace")), default="delta-cones", show_default=True)
 @click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="A setting that is not chosen.")
 @click.option("--width", type=click.IntRange(min=16), default=320, show_default=True, help="Pixels across.")

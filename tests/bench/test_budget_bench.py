@@ -1,0 +1,96 @@
+"""``bench budget`` and ``bench error-table``: rows of a tiny room, summaries and tables of known rows."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from click.testing import CliRunner
+
+from warp_dvct.bench import budget as module
+from warp_dvct.bench import error_table
+from warp_dvct.bench.__main__ import bench
+from warp_dvct.bench.rows import append_row, read_rows
+from warp_dvct.errors import OptionError
+from warp_dvct.settings import make_settings
+
+
+def row(seconds: float, flip: float | None = 0.03) -> dict:
+    """A budget of 2 s, predicted to take 1.9 s and to err by 0.03."""
+    predicted = {"seconds": 1.9, "cpu_seconds": 3.0, "error": 0.03}
+    return {
+        "stage": "s",
+        "budget": 2.0,
+        "predicted": predicted,
+        "seconds": seconds,
+        "cpu_seconds": 1.5 * seconds,
+        "flip": flip,
+    }
+
+
+def test_a_summary_counts_what_was_kept():
+    text = module.summarise([row(2.0), row(1.4), row(2.6, 0.05), row(2.4, None), {"refused": "floor"}])
+    assert "of 4 budgets, 2 were kept within 25% by the clock, and the latest took 1.30" in text
+    assert "of 3 errors, 2 were predicted within a factor of 1.5" in text
+    assert module.summarise([{"refused": "floor"}]) == "every budget was below the floor"
+
+
+def test_a_tiny_room_keeps_a_budget(tmp_path, monkeypatch):
+    """Predictions, times and errors are in the rows; a budget below the floor is said in its line."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    file = tmp_path / "rows.jsonl"
+    words = ["budget", "--stage", "colour_bleeding", "--width", "48", "--spp", "16", "--cache", str(tmp_path)]
+    flags = ["--budget", "0.001", "--budget", "1", "--set", "volume.resolution=64", "--out", str(file)]
+    result = CliRunner().invoke(bench, [*words, *flags], catch_exceptions=False)
+    assert result.exit_code == 0
+    refused, kept = read_rows(file, "budget")
+    assert "below the floor" in refused["refused"]
+    assert 0.5 < kept["predicted"]["seconds"] <= 1.0
+    assert 0 < kept["flip"] < 0.5
+    assert kept["cpu_seconds"] > 0
+    assert "of 1 budgets" in result.output
+
+
+def sweep_row(stage: str, flip: float, noise: float = 0.0, **settings) -> dict:
+    """A point of a sweep with a known error."""
+    pairs = {k.replace("__", "."): str(v) for k, v in settings.items()}
+    row = {"kind": "tradeoff", "stage": stage, "method": "delta-cones", "quality": "balanced", "width": 320}
+    row |= {"settings": {"bounces": "8", **pairs}, "truth": {"noise": noise, "bounces": 8}}
+    return {**row, "errors": {"FLIP": {"picture": math.hypot(flip, noise)}}}
+
+
+def test_a_table_holds_what_the_rows_say():
+    """Known errors of two rooms: excess of squared FLIP, noise taken out, dearer values never worse."""
+    rows = []
+    for stage, base in (("room_area", 0.02), ("room_spot", 0.03)):
+        for rays, factor in ((16, 2.0), (64, 1.0), (128, 1.1), (256, 0.8)):
+            rays_ = {"gather__rays": rays, "gather__object_rays": rays}
+            rows.append(sweep_row(stage, base * factor, noise=0.01, **rays_))
+    table, pairs = error_table.fit_table(rows)
+    values = dict(table.knobs["diffuse"]["gather.rays"])
+    assert values[16.0] == pytest.approx(3.0, abs=1e-3)
+    assert values[64.0] == values[128.0] == pytest.approx(0.105, abs=1e-3)  # pooled: 1 and 1.21
+    assert values[256.0] == pytest.approx(-0.36, abs=1e-3)
+    for name, measured, predicted in pairs:
+        assert predicted == pytest.approx(measured, rel=0.35), name
+    assert table.spread < 0.3
+
+
+def test_a_table_needs_a_base_and_a_knob():
+    with pytest.raises(OptionError, match="no stage has the balanced preset"):
+        error_table.fit_table([sweep_row("room_area", 0.02, gather__rays=16, gather__object_rays=16)])
+    with pytest.raises(OptionError, match="no knob was swept"):
+        error_table.fit_table([sweep_row("room_area", 0.02)])
+    assert make_settings("balanced", {"bounces": "8"}).bounces == 8
+
+
+def test_the_command_writes_a_table(tmp_path):
+    rows = [sweep_row("room_area", 0.02), sweep_row("room_area", 0.03, antialias=0)]
+    for made in rows:
+        append_row(tmp_path / "rows.jsonl", made)
+    out = tmp_path / "table.json"
+    words = ["error-table", str(tmp_path / "rows.jsonl"), "--out", str(out)]
+    result = CliRunner().invoke(bench, words, catch_exceptions=False)
+    assert "2 points; predicted within a factor of 1.5: 2" in result.output
+    assert json.loads(out.read_text())["knobs"]["diffuse"]["antialias"] == [[0.0, 1.25], [4.0, 0.0]]
