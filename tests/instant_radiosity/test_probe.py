@@ -196,6 +196,23 @@ def test_every_method_lights_a_floor_as_the_image_says(launcher, probe_stage):
     assert layers.delta.min() < -0.05  # the sun casts the box's shadow
 
 
+def test_the_probe_lights_as_bright_as_the_image_itself(launcher, probe_stage):
+    """The path tracer under the image as a plain dome, and under what the command made of it: the same level."""
+    scene = read_stage(probe_stage)
+    dome = next(light for light in scene.lights if light.kind == LightKind.DOME)
+    whole = replace(dome, texture=latlong_sky(128), radiance=(1.0, 1.0, 1.0))
+    floor = tuple(m for m in scene.meshes if m.role == Role.REAL)
+    levels = []
+    for lights in ((whole,), scene.lights):
+        bare = replace(scene, meshes=floor, lights=lights)
+        low, high = bare.bounds()
+        uploaded = DeviceScene.upload(launcher, bare, (low + high) / 2, 1 / float((high - low).max()))
+        levels.append(path_trace(launcher, uploaded, bare, 16, 16, samples=256, bounces=0).before.numpy().mean(0))
+    np.testing.assert_allclose(levels[1], levels[0], rtol=0.01)
+    # A Lambert floor under irradiance E sends back albedo E / pi.
+    np.testing.assert_allclose(levels[0], 0.5 * horizontal_irradiance(latlong_sky(128)) / np.pi, rtol=0.01)
+
+
 def test_the_layer_is_valid_and_says_what_was_found(tmp_path):
     text = lights_usda(extract_lights(latlong_sky(64)), "a.exr", 'my "sky".exr')
     (tmp_path / "a.usda").write_text(text)
