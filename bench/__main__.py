@@ -104,9 +104,23 @@ def table1(quality: str, preset: bool, pairs: tuple[str, ...], json_file: Path |
 @click.option("--runs", type=int, default=3, show_default=True, help="Warm runs; the median is printed.")
 @click.option("--bounces", type=int, multiple=True, default=(1, 3), show_default=True, help="Repeatable.")
 @click.option("--sight/--no-sight", default=True, show_default=True, help="Also compare shadow maps with rays.")
+@click.option(
+    "--still", "frames", type=int, multiple=True, help="Error after so many frames of a still shot; repeatable."
+)
+@click.option("--spp", type=int, default=128, show_default=True, help="Samples per pixel of the truth for --still.")
+@click.option("--cache", type=click.Path(path_type=Path), help="References; default: warp_dvct in the user's cache.")
 @shared
-def instant_radiosity(stage: str, pairs: tuple[str, ...], json_file: Path | None, sight: bool, **rest: Any) -> None:
-    """Times of instant radiosity at the paper's size and settings, and how well its shadow maps see."""
+def instant_radiosity(
+    stage: str,
+    pairs: tuple[str, ...],
+    json_file: Path | None,
+    sight: bool,
+    frames: tuple[int, ...],
+    spp: int,
+    cache: Path | None,
+    **rest: Any,
+) -> None:
+    """Times of instant radiosity at the paper's size and settings, how well its shadow maps see, what frames add."""
     start_warp(rest["device"])
     from warp_dvct.bench import instant_radiosity as module
     from warp_dvct.bench.error import read, stage_file
@@ -117,13 +131,18 @@ def instant_radiosity(stage: str, pairs: tuple[str, ...], json_file: Path | None
     width, height = module.PAPER_SIZE
     shown = " ".join(f"{k}={v}" for k, v in {**module.PAPER_SETTINGS, **settings}.items())
     click.echo(module.format_times(times, f"{stage}, {width}x{height}, {shown}, median of {rest['runs']}"))
-    rows = []
+    rows, stills = [], []
+    launcher = Launcher(rest["device"], rest["threads"])
+    if frames:
+        cache = cache or cache_folder() / "references"
+        stills = module.still(stage, frames, settings=settings, launcher=launcher, samples=spp, cache=cache)
+        click.echo("\n" + module.format_still(stills, f"{stage}: a still shot against the path tracer, one bounce"))
     if sight:
-        launcher = Launcher(rest["device"], rest["threads"])
         rows = module.agreement(read(stage_file(stage)), module.POINTS, settings=settings, launcher=launcher)
         click.echo("\n" + module.format_agreement(rows, f"{stage}: imperfect shadow maps against exact rays"))
     if json_file is not None:
-        content = {"machine": module.machine(), "times": [asdict(t) for t in times], "sight": [asdict(r) for r in rows]}
+        measured = {"times": times, "still": stills, "sight": rows}
+        content = {"machine": module.machine(), **{k: [asdict(r) for r in v] for k, v in measured.items()}}
         write_json(json_file, content)
 
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import median
 
 import numpy as np
 
+from warp_dvct.bench.references import ReferenceStore
 from warp_dvct.bench.table1 import machine
 from warp_dvct.device_scene import DeviceScene, camera_frame
 from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher
 from warp_dvct.methods.instant_radiosity import lit_region, make_vpls
+from warp_dvct.metrics import flip_ldr, rmse
 from warp_dvct.passes.gbuffer import render_gbuffer
 from warp_dvct.passes.ism import draw_isms, new_isms, ray_sight
 from warp_dvct.passes.point_cloud import sample_surfaces
@@ -32,18 +35,24 @@ PAPER_SETTINGS = {
     "antialias": "0",
     "visibility": "ism",
 }
+STILL_WIDTH = 160  # pixels
 POINTS = (128, 256, 512, 1024, 2048, 4096)
 
 
 @dataclass(frozen=True)
 class Times:
-    """Median milliseconds per pass with ``bounces`` bounces: a first frame, and the next of the unchanged scene."""
+    """Median milliseconds per pass with ``bounces`` bounces: a first frame, and the next of the unchanged scene.
+
+    ``first_cpu`` and ``next_cpu`` are processor time of all threads together, which a busy machine changes less.
+    """
 
     bounces: int
     first: dict[str, float]
     next: dict[str, float]
     first_total: float
     next_total: float
+    first_cpu: float
+    next_cpu: float
     peak_mib: float
 
 
@@ -94,6 +103,8 @@ def measure(
                 _medians(following),
                 1e3 * median(s["render_seconds"] for s in first),
                 1e3 * median(s["render_seconds"] for s in following),
+                1e3 * median(s["cpu_seconds"] for s in first),
+                1e3 * median(s["cpu_seconds"] for s in following),
                 max(s["peak_bytes"] for s in first) / 2**20,
             )
         )
@@ -133,6 +144,49 @@ def agreement(
     return rows
 
 
+@dataclass(frozen=True)
+class Still:
+    """Error of a still shot after ``frames`` frames: LDR-FLIP, and RMSE of the composite, linear."""
+
+    frames: int
+    flip: float
+    rmse: float
+
+
+def still(
+    stage: str, frames: Sequence[int], *, settings: dict[str, str], launcher: Launcher, samples: int, cache: Path
+) -> list[Still]:
+    """Errors against the path tracer's one-bounce light while nothing moves and ``vpls.frames`` averages.
+
+    Raises:
+        OptionError: A number of frames below 1.
+    """
+    if min(frames) < 1:
+        raise OptionError(f"--still is {min(frames)}; give a number of at least 1")
+    from warp_dvct.bench.error import read, stage_file
+    from warp_dvct.relighter import Relighter
+
+    scene = read(stage_file(stage))
+    height = max(1, round(STILL_WIDTH / scene.camera.aspect))
+    store = ReferenceStore(scene, STILL_WIDTH, height, samples=samples, seed=1, cache=cache, launcher=launcher)
+    truth = store.get(1)
+    values = {**settings, "bounces": "1", "vpls.frames": str(max(max(frames), 2))}
+    relighter = Relighter(scene, method="instant-radiosity", width=STILL_WIDTH, height=height, settings=values)
+    rows = []
+    for frame in range(1, max(frames) + 1):
+        comp = relighter.render(truth.before).comp
+        if frame in frames:
+            rows.append(Still(frame, float(flip_ldr(truth.comp, comp)[0]), rmse(truth.comp, comp)))
+    return rows
+
+
+def format_still(rows: list[Still], title: str) -> str:
+    """A line per number of frames."""
+    return "\n".join(
+        [title, f"{'frames':>8}{'FLIP':>10}{'RMSE':>10}", *(f"{r.frames:8}{r.flip:10.4f}{r.rmse:10.5f}" for r in rows)]
+    )
+
+
 def _medians(frames: list[dict]) -> dict[str, float]:
     names = dict.fromkeys(name for stats in frames for name in stats["passes"])
     return {name: 1e3 * median(stats["passes"].get(name, 0.0) for stats in frames) for name in names}
@@ -152,6 +206,7 @@ def format_times(times: list[Times], title: str) -> str:
         cells = "".join(f"{t.first.get(name, 0.0):12.1f}{t.next.get(name, 0.0):10.1f}" for t in times)
         lines.append(f"{name:20}{cells}")
     lines.append(f"{'whole frame':20}" + "".join(f"{t.first_total:12.1f}{t.next_total:10.1f}" for t in times))
+    lines.append(f"{'processor time':20}" + "".join(f"{t.first_cpu:12.1f}{t.next_cpu:10.1f}" for t in times))
     lines.append(f"{'peak MiB':20}" + "".join(f"{t.peak_mib:12.1f}{'':10}" for t in times))
     lines.append("the paper: 18 frames a second, 56 ms, on a GTX 580")
     return "\n".join(lines)
