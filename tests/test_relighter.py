@@ -30,7 +30,7 @@ FAST = {
     "bounces": 3,
 }
 SIZE = {"width": 48, "height": 32}
-ARRAYS = [f.name for f in fields(Layers) if f.name not in ("clamped", "invalid")]
+ARRAYS = [f.name for f in fields(Layers) if f.name not in ("holes", "clamped", "invalid")]
 MATERIALS = [
     Material(base_color=(0.6, 0.6, 0.6), ior=1.0),
     Material(base_color=(0.7, 0.2, 0.1), ior=1.0),

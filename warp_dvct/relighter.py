@@ -17,6 +17,7 @@ from warp_dvct.layers import Layers, Radiance
 from warp_dvct.methods import delta_cone_tracing, instant_radiosity, path_tracing
 from warp_dvct.passes.composite import composite
 from warp_dvct.passes.difference import tonemap_difference
+from warp_dvct.passes.lens import LensView
 from warp_dvct.plan import Plan, make_plan
 from warp_dvct.scene import Notice, Role, Scene
 from warp_dvct.settings import make_settings
@@ -108,6 +109,9 @@ class Relighter:
         self.width, self.height = self._picture_size()
         if self._launcher.checker is not None:
             self._launcher.checker.width, self._launcher.checker.height = self.width, self.height
+        # Behind a lens that bends, a pinhole's picture of another size is drawn.
+        self._lens = LensView.of(self.scene.camera, self.width, self.height)
+        self._drawn = self.scene if self._lens is None else replace(self.scene, camera=self._lens.camera)
         self._plan(has_plate=self.scene.plate is not None or self._had_plate)
 
     def set_scene(self, scene: Scene) -> None:
@@ -210,9 +214,17 @@ class Relighter:
 
     def _plan(self, *, has_plate: bool) -> None:
         self._planned_plate = has_plate
-        self._current_plan = make_plan(
-            self.scene, self.settings, self.method, self.width, self.height, has_plate=has_plate
-        )
+        size = (self.width, self.height)
+        if self._lens is not None:
+            size = self._lens.drawn_width, self._lens.drawn_height
+        self._current_plan = make_plan(self._drawn, self.settings, self.method, *size, has_plate=has_plate)
+
+    def _through_lens(self, radiance: Radiance) -> Radiance:
+        """What was drawn as the camera's lens shows it."""
+        if self._lens is None:
+            return radiance
+        with self._launcher.scope("lens"):
+            return self._lens.bend(self._launcher, radiance)
 
     def _picture_size(self) -> tuple[int, int]:
         width, height = self._size
@@ -236,14 +248,14 @@ class Relighter:
     def _device_scene(self) -> DeviceScene:
         """The scene on the device: the kept one, with the camera of this frame, where nothing else changed."""
         origin, scale = np.asarray(self.plan.origin), self.plan.scale
-        real, key = _content_keys(self.scene, self.plan)
+        real, key = _content_keys(self._drawn, self.plan)
         if self._uploaded is None or self._uploaded[0] != key:
             with self._launcher.scope("upload"):
                 self._uploaded = None  # free the old one first
                 self._kept.set_real(real)
-                uploaded = DeviceScene.upload(self._launcher, self.scene, origin, scale, self._kept)
+                uploaded = DeviceScene.upload(self._launcher, self._drawn, origin, scale, self._kept)
             self._uploaded = (key, uploaded, None)
-        return replace(self._uploaded[1], camera=camera_frame(self.scene.camera, origin, scale))
+        return replace(self._uploaded[1], camera=camera_frame(self._drawn.camera, origin, scale))
 
     def _lit(self, kind: type[LitKind], make: Callable[[DeviceScene], LitKind]) -> tuple[DeviceScene, LitKind]:
         """The scene on the device and what the method made of its light, kept until something else than the camera
@@ -258,19 +270,20 @@ class Relighter:
 
     def _delta_cones(self, with_before: bool, report: Progress) -> Radiance:
         report("volumes", 0.0)
-        launcher, scene, plan = self._launcher, self.scene, self.plan
+        launcher, scene, plan = self._launcher, self._drawn, self.plan
         device_scene, light_field = self._lit(
             delta_cone_tracing.LightField,
             lambda uploaded: delta_cone_tracing.light_volumes(launcher, scene, uploaded, plan, self._kept),
         )
         report("shading", 0.5)
-        return delta_cone_tracing.render(
+        radiance = delta_cone_tracing.render(
             launcher, scene, device_scene, light_field, plan, with_before=with_before, kept=self._kept
         )
+        return self._through_lens(radiance)
 
     def _instant_radiosity(self, plate: np.ndarray | None, ldr: bool, report: Progress) -> Radiance:
         report("virtual point lights", 0.0)
-        launcher, scene, plan = self._launcher, self.scene, self.plan
+        launcher, scene, plan = self._launcher, self._drawn, self.plan
         device_scene, shot = self._lit(
             instant_radiosity.Shot, lambda uploaded: instant_radiosity.Shot(launcher, scene, uploaded, plan)
         )
@@ -279,23 +292,25 @@ class Relighter:
         wanted = difference == "tonemapped" or (difference == "auto" and ldr)
         tonemapped = plate is not None and wanted and plan.changes
         radiance = shot.render(launcher, scene, device_scene, plan, with_before=plate is None or tonemapped)
+        radiance = self._through_lens(radiance)
         self._method_notices = shot.notices
         return tonemap_difference(launcher, radiance, plate) if plate is not None and tonemapped else radiance
 
     def _path_trace(self, report: Progress) -> Radiance:
         device_scene = self._device_scene()
         with self._launcher.scope("path trace"):
-            return path_tracing.path_trace(
+            radiance = path_tracing.path_trace(
                 self._launcher,
                 device_scene,
-                self.scene,
-                self.width,
-                self.height,
+                self._drawn,
+                self.plan.width,
+                self.plan.height,
                 samples=self.settings.samples,
                 bounces=self.settings.bounces,
                 seed=self.settings.seed,
                 progress=lambda done, total: report("path trace", 0.95 * done / total),
             )
+        return self._through_lens(radiance)
 
 
 def _content_keys(scene: Scene, plan: Plan) -> tuple[str, str]:

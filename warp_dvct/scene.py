@@ -195,6 +195,7 @@ class Camera:
             negative for a centred camera): aperture offsets are in here.
         near, far: Clipping range in metres.
         path: Prim path.
+        distortion: Of its lens, OpenCV's coefficients (``warp_dvct.lens``); the edges are those of the bent image.
     """
 
     to_world: np.ndarray
@@ -205,6 +206,7 @@ class Camera:
     near: float = 0.0
     far: float = float("inf")
     path: str = ""
+    distortion: tuple[float, ...] = ()
 
     @property
     def aspect(self) -> float:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from warp_dvct.capture.intrinsics import Intrinsics, distort, undistort
+from warp_dvct.capture.intrinsics import Intrinsics
 from warp_dvct.errors import OptionError
+from warp_dvct.lens import distort, undistort
 
 FIVE = (0.26, -0.95, -0.005, 0.0026, 1.16)  # of freiburg1 in the TUM benchmark
 TWELVE = (0.3, -0.1, 0.001, -0.002, 0.05, 0.2, 0.03, 0.01, 0.002, -0.001, 0.003, 0.0005)

@@ -105,10 +105,22 @@ def test_what_a_pinhole_lacks_is_listed(build):
     camera.CreateFocusDistanceAttr(3.0)
     camera.CreateShutterCloseAttr(0.5)
     camera.CreateExposureAttr(1.0)
-    prim.CreateAttribute("omni:lensdistortion:opencvPinhole:k1", Sdf.ValueTypeNames.Float).Set(0.1)
+    prim.CreateAttribute("omni:lensdistortion:ftheta:k1", Sdf.ValueTypeNames.Float).Set(0.1)
     text = " ".join(n.message for n in build.read().notices)
     for word in ("depth of field", "motion blur", "exposure", "lens distortion"):
         assert word in text
+
+
+def test_opencv_distortion_is_read(build):
+    prim = build.stage.GetPrimAtPath("/World/Camera")
+    for name, value in (("k1", 0.25), ("p2", -0.5)):
+        prim.CreateAttribute(f"omni:lensdistortion:opencvPinhole:{name}", Sdf.ValueTypeNames.Float).Set(value)
+    scene = build.read()
+    assert scene.camera.distortion == (0.25, 0.0, 0.0, -0.5)
+    assert scene.notices == ()
+    prim.GetAttribute("omni:lensdistortion:opencvPinhole:k1").Set(float("nan"))
+    with pytest.raises(StageError, match="must be finite"):
+        build.read()
 
 
 def test_plate_of_the_camera_follows_time_and_is_overridden(build, tmp_path):

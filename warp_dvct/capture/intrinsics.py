@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from warp_dvct.errors import OptionError
+from warp_dvct.lens import COEFFICIENTS, distort, undistort
 from warp_dvct.scene import Camera
 
 # OpenCV's camera axes as seen from USD's (x right, y up, z backward), and back: its own inverse.
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Intrinsics:
         return self.width, self.height
 
     def scene_camera(self, pose: np.ndarray, path: str = "") -> Camera:
-        """The camera for rendering, without its distortion.
+        """The camera for rendering.
 
         Args:
             pose: Camera (OpenCV axes) to world, 4x4 for column vectors.
@@ -79,6 +79,7 @@ class Intrinsics:
             tan_right=(self.width - 0.5 - self.cx) / self.fx,
             tan_bottom=(self.cy - self.height + 0.5) / self.fy,
             tan_top=(self.cy + 0.5) / self.fy,
+            distortion=self.distortion if self.is_distorted else (),
             path=path,
         )
 
@@ -87,7 +88,8 @@ class Intrinsics:
         """The inverse of :meth:`scene_camera` for a picture of that size."""
         fx = width / (camera.tan_right - camera.tan_left)
         fy = height / (camera.tan_top - camera.tan_bottom)
-        return cls(width, height, fx, fy, -camera.tan_left * fx - 0.5, camera.tan_top * fy - 0.5)
+        cx, cy = -camera.tan_left * fx - 0.5, camera.tan_top * fy - 0.5
+        return cls(width, height, fx, fy, cx, cy, camera.distortion)
 
     def rays(self) -> np.ndarray:
         """Undistorted directions through all pixel centres with z = 1, float64 ``[h, w, 3]``."""
@@ -100,44 +102,3 @@ class Intrinsics:
         z = np.where(points[..., 2] > 0.0, points[..., 2], np.nan)
         x, y = distort(points[..., 0] / z, points[..., 1] / z, self.distortion)
         return np.stack([x * self.fx + self.cx, y * self.fy + self.cy], -1)
-
-
-def _full(distortion: tuple[float, ...]) -> np.ndarray:
-    return np.pad(np.asarray(distortion, np.float64), (0, len(COEFFICIENTS) - len(distortion)))
-
-
-def distort(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Where a lens shows the direction (x, y, 1): OpenCV's rational model with tangential and thin-prism terms."""
-    if not any(distortion):
-        return x, y
-    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = _full(distortion)
-    r2 = x * x + y * y
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    a, b, c = 2 * x * y, r2 + 2 * x * x, r2 + 2 * y * y
-    return x * radial + p1 * a + p2 * b + r2 * (s1 + s2 * r2), y * radial + p1 * c + p2 * a + r2 * (s3 + s4 * r2)
-
-
-def undistort(
-    x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...], *, steps: int = 20
-) -> tuple[np.ndarray, np.ndarray]:
-    """The inverse of :func:`distort` by Newton steps with differences as derivatives.
-
-    Where a lens model folds back (beyond its calibrated field) there is no inverse; the result there is NaN.
-    """
-    if not any(distortion):
-        return x, y
-    u, v = np.array(x, np.float64), np.array(y, np.float64)
-    h = 1e-6  # of the unit plane: far below a pixel, far above float64's rounding
-    for _ in range(steps):
-        px, py = distort(u, v, distortion)
-        ax, ay = distort(u + h, v, distortion)
-        bx, by = distort(u, v + h, distortion)
-        a, b, c, d = (ax - px) / h, (bx - px) / h, (ay - py) / h, (by - py) / h
-        determinant = a * d - b * c
-        determinant = np.where(determinant > 1e-6, determinant, np.nan)
-        ex, ey = px - x, py - y
-        u, v = u - (d * ex - b * ey) / determinant, v - (a * ey - c * ex) / determinant
-    px, py = distort(u, v, distortion)
-    with np.errstate(invalid="ignore"):
-        good = np.hypot(px - x, py - y) < 1e-6
-    return np.where(good, u, np.nan), np.where(good, v, np.nan)

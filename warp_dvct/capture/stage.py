@@ -21,11 +21,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warp_dvct.capture.images import image_size, read_color, read_depth
-from warp_dvct.capture.intrinsics import COEFFICIENTS, FLIP, Intrinsics
+from warp_dvct.capture.intrinsics import FLIP, Intrinsics
 from warp_dvct.errors import FileError, StageError
 from warp_dvct.image import replacing
+from warp_dvct.lens import COEFFICIENTS
 from warp_dvct.scene import Camera
-from warp_dvct.usd.camera import read_camera
+from warp_dvct.usd.camera import LENS, read_camera
 from warp_dvct.usd.context import Context
 from warp_dvct.usd.stage import name_of, open_stage, quiet_diagnostics, world_frame
 from warp_dvct.usd.textures import asset_file
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 ROOT = "/Capture"
 APERTURE = 20.955  # horizontal, of the schema's fallback; only its ratio to the focal length counts
 RIGID = 1e-3  # error of R^T R and of the determinant up to which a pose counts as rigid
-DISTORTION = "omni:lensdistortion:opencvPinhole"  # NVIDIA's names
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ def _define_camera(stage: Usd.Stage, path: str, lens: Intrinsics) -> Any:
     prim = camera.GetPrim()
 
     def author(name: str, kind: Any, value: Any) -> None:
-        prim.CreateAttribute(f"{DISTORTION}:{name}", kind, custom=False).Set(value)
+        prim.CreateAttribute(f"{LENS}:{name}", kind, custom=False).Set(value)
 
     prim.AddAppliedSchema("OmniLensDistortionOpenCvPinholeAPI")
     prim.CreateAttribute("omni:lensdistortion:model", Sdf.ValueTypeNames.Token, custom=False).Set("opencvPinhole")
@@ -436,18 +436,13 @@ def _read_rig(prim: Usd.Prim, stage: Usd.Stage, time: float, name: str) -> Captu
 def _read_intrinsics(prim: Usd.Prim, stage: Usd.Stage, time: float, images: str) -> Intrinsics:
     """From the apertures, and the size that is authored or that the first image has."""
     metres, frame = world_frame(stage)
-    authored = prim.GetAttribute(f"{DISTORTION}:imageSize")
+    authored = prim.GetAttribute(f"{LENS}:imageSize")
     if authored and authored.HasAuthoredValue():
         width, height = (int(n) for n in authored.Get())
     else:
         attribute = prim.GetAttribute(images)
         width, height = image_size(asset_file(attribute, attribute.Get(time), "image"), f"{prim.GetPath()}: image")
-    lens = Intrinsics.of_scene_camera(_camera_at(prim, stage, metres, frame, time), width, height)
-    values = [prim.GetAttribute(f"{DISTORTION}:{name}") for name in COEFFICIENTS]
-    coefficients = [float(v.Get() or 0.0) if v else 0.0 for v in values]
-    while coefficients and coefficients[-1] == 0.0:
-        coefficients.pop()
-    return Intrinsics(width, height, lens.fx, lens.fy, lens.cx, lens.cy, tuple(coefficients))
+    return Intrinsics.of_scene_camera(_camera_at(prim, stage, metres, frame, time), width, height)
 
 
 def _camera_at(prim: Usd.Prim, stage: Usd.Stage, metres: float, frame: np.ndarray, time: float) -> Camera:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_dvct.errors import FileError, StageError
+from warp_dvct.lens import COEFFICIENTS
 from warp_dvct.scene import Camera
 from warp_dvct.usd.context import Context, matrix
 from warp_dvct.usd.stage import name_of
@@ -16,6 +17,8 @@ from warp_dvct.usd.textures import asset_file
 
 if TYPE_CHECKING:
     from pxr import Usd
+
+LENS = "omni:lensdistortion:opencvPinhole"  # NVIDIA's names
 
 
 def choose_camera(ctx: Context, name: str | None) -> Usd.Prim:
@@ -81,6 +84,7 @@ def read_camera(prim: Usd.Prim, ctx: Context) -> Camera:
         near=near,
         far=far,
         path=path,
+        distortion=_distortion(prim, ctx),
     )
 
 
@@ -124,8 +128,23 @@ def _note_camera(camera, ctx: Context) -> None:
         ctx.notices.add(path, "clippingPlanes are not used")
     if hasattr(camera, "ComputeLinearExposureScale") and camera.ComputeLinearExposureScale(ctx.time) != 1.0:
         ctx.notices.add(path, "the camera's exposure is not applied")
-    if any(a.GetName().startswith("omni:lensdistortion") for a in prim.GetAuthoredAttributes()):
-        ctx.notices.add(path, "lens distortion is not modelled")
+    other = [a.GetName() for a in prim.GetAuthoredAttributes() if a.GetName().startswith("omni:lensdistortion")]
+    if any(name.split(":")[2] not in ("model", "opencvPinhole") for name in other if name.count(":") > 1):
+        ctx.notices.add(path, "lens distortion is modelled for opencvPinhole only")
+
+
+def _distortion(prim: Usd.Prim, ctx: Context) -> tuple[float, ...]:
+    """OpenCV's coefficients by NVIDIA's names; () where none is authored or all are 0."""
+    values = []
+    for name in COEFFICIENTS:
+        attribute = prim.GetAttribute(f"{LENS}:{name}")
+        value = attribute.Get(ctx.time) if attribute else None
+        values.append(0.0 if value is None else float(value))
+    if not np.isfinite(values).all():
+        raise StageError(f"{prim.GetPath()}: {LENS} has the coefficients {values}; they must be finite")
+    while values and values[-1] == 0.0:
+        values.pop()
+    return tuple(values)
 
 
 def read_plate(prim: Usd.Prim, ctx: Context, override: str | os.PathLike | None) -> str | None:
