@@ -78,7 +78,7 @@ def usable_frames(
             skipped.add(index, str(error))
             continue
         if posed and frame.pose is None:
-            skipped.add(index, f"{frame.name}: its pose is not known")
+            skipped.add(index, f"{frame.name}: its pose is not known; find it by --track or --markers")
         elif not (frame.depth > 0.0).any():
             skipped.add(index, f"{frame.name}: no pixel has a depth")
         else:

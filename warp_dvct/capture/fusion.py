@@ -11,7 +11,7 @@ Curless and Levoy 1996, "A Volumetric Method for Building Complex Models from Ra
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,13 +23,14 @@ from warp_dvct.extras import load_open3d
 BLOCK = 16  # voxels an edge of a block
 BYTES_PER_VOXEL = 20  # distance, weight and colour, all float32
 MEMORY_SHARE = 0.5  # of the memory that is free: the mesh needs the other half
-COUNT_STRIDE = 4  # pixels; of 2.7 cm at 4 m and f = 585, so no block of 16 voxels is stepped over
-SPARE_BLOCKS = 1.1  # the hash map rehashes, for seconds, when it is full
+COUNT_PIXELS = 160  # across an image that are looked at to count blocks: 2.7 cm apart at 4 m
+SPARE_BLOCKS = 1.25  # the hash map rehashes, for seconds, when it is full
 # Noise of 1/depth [1/m] of structured light: 1/6 pixel at f = 585 px and a baseline of 75 mm (Khoshelham 2012).
 INVERSE_DEPTH_NOISE = 1.0 / 6.0 / (585.0 * 0.075)
 SMOOTH_WINDOW = 7  # pixels across
 SMOOTH_RANGE = 5.0  # standard deviations of the noise that still count as the same surface
 JUMP = 6.0  # standard deviations between neighbours beyond which a pixel lies on the edge of something
+HALF_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
 LEAST_EDGE = 10.0  # voxels; components with less area than this squared are floaters
 
 
@@ -153,7 +154,8 @@ def count_blocks(source: FrameSource, options: FusionOptions, skipped: Skipped, 
         points, rays = _sample_points(frame, options)
         band = options.truncation * options.voxel
         cells = [
-            np.floor((points + offset * rays) / (options.voxel * BLOCK)).astype(np.int64) for offset in (-band, 0, band)
+            np.floor((points + share * band * rays) / (options.voxel * BLOCK)).astype(np.int64)
+            for share in (-1.0, -0.5, 0.0, 0.5, 1.0)
         ]
         # 21 bits a coordinate: two million blocks either way.
         packed = [((c[:, 0] + 2**20) << 42) | ((c[:, 1] + 2**20) << 21) | (c[:, 2] + 2**20) for c in cells]
@@ -163,12 +165,13 @@ def count_blocks(source: FrameSource, options: FusionOptions, skipped: Skipped, 
 
 
 def _sample_points(frame: RgbdFrame, options: FusionOptions) -> tuple[np.ndarray, np.ndarray]:
-    """World positions of every fourth pixel either way, and the unit directions in which they are seen."""
+    """World positions of some pixels, and the unit directions in which they are seen."""
     assert frame.pose is not None
-    depth = frame.depth[::COUNT_STRIDE, ::COUNT_STRIDE]
+    stride = max(1, frame.depth.shape[1] // COUNT_PIXELS)
+    depth = frame.depth[::stride, ::stride]
     v, u = np.nonzero((depth >= options.near) & (depth <= options.far))
     z = depth[v, u].astype(np.float64)
-    pixels = np.stack([u * COUNT_STRIDE, v * COUNT_STRIDE, np.ones(len(u))], -1)
+    pixels = np.stack([u * stride, v * stride, np.ones(len(u))], -1)
     local = (pixels @ np.linalg.inv(frame.K).T) * z[:, None]
     points = local @ frame.pose[:3, :3].T + frame.pose[:3, 3]
     return points, (local / np.linalg.norm(local, axis=-1, keepdims=True)) @ frame.pose[:3, :3].T
@@ -201,15 +204,18 @@ def _integrate(
     band = (1.0, options.far, options.truncation)  # metres per step, most depth, truncation
     for index, frame in usable_frames(source, skipped):
         depth = clean_depth(o3d, frame.depth, options)
-        K, extrinsic = core.Tensor(frame.K), core.Tensor(np.linalg.inv(frame.pose))
-        image = o3d.t.geometry.Image(core.Tensor(depth))
-        touched = grid.compute_unique_block_coordinates(image, K, extrinsic, *band)
-        color = np.zeros((*depth.shape, 3), np.float32) if frame.color is None else frame.color
+        # Open3D cuts pixel coordinates off instead of rounding: its pixel centres lie at half numbers.
+        K, extrinsic = core.Tensor(frame.K + HALF_PIXEL), core.Tensor(np.linalg.inv(frame.pose))
+        color = np.zeros((*depth.shape[:2], 3), np.float32) if frame.color is None else frame.color
         # A pixel without colour would pull the mean to black: its depth waits for a frame that sees it in colour.
         unseen = ~np.isfinite(color).all(-1)
         if unseen.any():
             depth[unseen], color = 0.0, np.where(unseen[..., None], np.float32(0.0), color)
-            image = o3d.t.geometry.Image(core.Tensor(depth))
+        if not depth.any():
+            skipped.add(index, f"{frame.name}: no pixel is between {options.near:g} and {options.far:g} m")
+            continue
+        image = o3d.t.geometry.Image(core.Tensor(depth))
+        touched = grid.compute_unique_block_coordinates(image, K, extrinsic, *band)
         tint = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(color, np.float32)))
         grid.integrate(touched, image, tint, K, K, extrinsic, *band)
         report((index + 1) / len(source))
@@ -236,14 +242,15 @@ def clean_depth(o3d: Any, depth: np.ndarray, options: FusionOptions) -> np.ndarr
 
 
 def _at_jump(inverse: np.ndarray) -> np.ndarray:
-    """Pixels beside one that differs by more than noise and the slope of a surface do.
+    """Pixels beside one that differs by more than noise and the slope of a surface do; holes are no jumps.
 
     The second difference is that of the noise alone where the surface is plane, however it slopes.
     """
     jump = np.zeros(inverse.shape, bool)
     limit = JUMP * INVERSE_DEPTH_NOISE
-    across = np.abs(np.diff(inverse, 2, axis=1)) > limit
-    down = np.abs(np.diff(inverse, 2, axis=0)) > limit
+    known = inverse > 0.0
+    across = known[:, :-2] & known[:, 2:] & (np.abs(np.diff(inverse, 2, axis=1)) > limit)
+    down = known[:-2] & known[2:] & (np.abs(np.diff(inverse, 2, axis=0)) > limit)
     jump[:, 1:-1] |= across
     jump[1:-1] |= down
     return jump
@@ -281,8 +288,3 @@ def _finished(o3d: Any, mesh: Any, options: FusionOptions, skipped: Skipped, fra
 def _closed(o3d: Any, legacy: Any, radius: float) -> Any:
     """Triangles over holes up to that radius; they take colour and normals of the rim's vertices, which they share."""
     return o3d.t.geometry.TriangleMesh.from_legacy(legacy).fill_holes(radius).to_legacy()
-
-
-def without_colors(mesh: FusedMesh) -> FusedMesh:
-    """The mesh without colours, as where no frame had a photograph."""
-    return replace(mesh, colors=None)
