@@ -15,7 +15,9 @@ from warp_dvct.cli import cli
 from warp_dvct.cli.warmup import kernel_modules
 from warp_dvct.errors import CheckError
 from warp_dvct.image import write_radiance
+from warp_dvct.kernels.gbuffer import Points
 from warp_dvct.launch import Launcher
+from warp_dvct.passes.gbuffer import new_points
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,6 +25,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def _divide(
     first: int,
+    points: Points,
     top_in: wp.array(dtype=wp.float32),
     bottom_in: wp.array(dtype=wp.float32),
     scale: float,
@@ -34,11 +37,12 @@ def _divide(
 
 def divide(launcher: Launcher, top, bottom, count: int | None = None) -> None:
     """Run ``_divide`` in a pass of its own."""
-    launcher.checker.width, launcher.checker.height = 4, 2
+    points = new_points(launcher, len(top))
+    points.pixel = launcher.array(np.stack([np.arange(len(top)) % 4, np.arange(len(top)) // 4], 1), wp.vec2i)
     with launcher.scope("division"):
         out = launcher.empty(len(top), wp.float32)
         arrays = [launcher.array(np.asarray(v, np.float32), wp.float32) for v in (top, bottom)]
-        launcher.launch(_divide, count or len(top), [*arrays, 0.5], [out])
+        launcher.launch(_divide, count or len(top), [points, *arrays, 0.5], [out])
 
 
 @pytest.fixture
@@ -61,7 +65,8 @@ def test_a_wrong_value_is_named_with_pass_array_pixel_and_inputs(checking, top, 
         divide(checking, tops, bottoms)
     message = str(caught.value)
     assert message.startswith(f"pass 'division', kernel _divide: mask_real_out[6] (pixel 2, 1) {wrong}")
-    assert f"scale = 0.5; top_in[6] = {top:g}; bottom_in[6] = {bottom:g}" in message
+    assert "scale = 0.5; " in message
+    assert message.endswith(f"top_in[6] = {top:g}; bottom_in[6] = {bottom:g}")
 
 
 def test_what_a_kernel_leaves_alone_is_no_error_but_reading_it_is(checking):
@@ -77,7 +82,7 @@ def test_without_check_nothing_is_looked_at():
     assert launcher.checker is None
     out = launcher.empty(1, wp.float32)
     zero = launcher.zeros(1, wp.float32)
-    launcher.launch(_divide, 1, [zero, zero, 1.0], [out])
+    launcher.launch(_divide, 1, [new_points(launcher, 1), zero, zero, 1.0], [out])
     assert np.isnan(out.numpy()[0])
 
 
@@ -93,6 +98,16 @@ def test_ranges_name_outputs_that_kernels_have():
         kernel, _, output = name.rpartition(".")
         assert output in names
         assert not kernel or kernel in keys
+
+
+def test_no_pixel_is_named_where_elements_are_something_else():
+    """A light's infinite radiance shows first in its map, whose texels are no pixels."""
+    stage = usd_scenes.path("room_area")
+    scene = Relighter(stage, width=16).scene
+    lamp = dataclasses.replace(scene.lights[0], radiance=(float("inf"), 1.0, 1.0))
+    relighter = Relighter(dataclasses.replace(scene, lights=(lamp,)), width=16, check=True, quality="draft")
+    with pytest.raises(CheckError, match=r"pass 'rsm', kernel _render_real: flux_out\[\d+\] is \(inf"):
+        relighter.render()
 
 
 @pytest.mark.parametrize(

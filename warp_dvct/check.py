@@ -46,6 +46,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "probability": (0.0, 3.0e38),
 }
 
+PICTURES = ("composite", "difference", "path_tracing")  # kernel files whose elements are a picture's pixels
+
 
 class Checker:
     """Checks what kernels wrote. ``Launcher.checker`` holds one where ``--check`` asks for it.
@@ -82,17 +84,24 @@ class Checker:
             if bad is None:
                 continue
             element, wrong = bad
-            given = "; ".join(_inputs(names, inputs, count, len(values), element))
+            given = list(_arrays(names, inputs))
+            thread, point = _owner(given, count, len(values), element)
+            pixel = self._pixel(kernel, [*given, *_arrays(names[len(inputs) :], outputs)], point)
+            there = "; ".join(_inputs(names, inputs, count, len(values), (element, thread, point)))
             raise CheckError(
-                f"pass '{scope}', kernel {kernel.key}: {name}[{element}]{self._pixel(element, len(values))} is"
-                f" {_text(values[element])}, which {wrong}; its inputs there: {given or 'none'}"
+                f"pass '{scope}', kernel {kernel.key}: {name}[{element}]{pixel} is {_text(values[element])},"
+                f" which {wrong}; its inputs there: {there or 'none'}"
             )
 
-    def _pixel(self, element: int, length: int) -> str:
-        pixels = self.width * self.height
-        if pixels == 0 or length < pixels or element >= pixels:
+    def _pixel(self, kernel: wp.Kernel, arrays: Sequence[tuple[str, Any]], point: int) -> str:
+        """Where shading points know their pixel, or a kernel's elements are pixels: which."""
+        for name, array in arrays:
+            if name in ("points.pixel", "points_out.pixel") and 0 <= point < len(array):
+                column, row = array.numpy()[point].tolist()
+                return f" (pixel {column}, {row})"
+        if kernel.module.name.rpartition(".")[2] not in PICTURES or not 0 <= point < self.width * self.height:
             return ""
-        return f" (pixel {element % self.width}, {element // self.width})"
+        return f" (pixel {point % self.width}, {point // self.width})"
 
 
 def poison(array: wp.array) -> wp.array:
@@ -152,18 +161,24 @@ def _bad(values: np.ndarray, low: float, high: float) -> tuple[int, str] | None:
     return int(rows[0]), f"is outside of {low:g} … {high:g}"
 
 
-def _inputs(names: Sequence[str], values: Sequence[Any], count: int, length: int, element: int) -> Iterator[str]:
-    """Scalars, and the entries of arrays that belong to the element, its thread, or the point its thread works on."""
+def _owner(given: Sequence[tuple[str, Any]], count: int, length: int, element: int) -> tuple[int, int]:
+    """The thread that wrote an element, and the shading point that it works on (or the element itself)."""
     thread = element // max(1, length // count) if length > count else element
-    arrays = list(_arrays(names[: len(values)], values))
-    point = element
-    for name, array in arrays:
+    for name, array in given:
         if name == "index_in" and thread < len(array):
-            point = int(array.numpy()[thread])
+            return thread, int(array.numpy()[thread])
+    return thread, element
+
+
+def _inputs(
+    names: Sequence[str], values: Sequence[Any], count: int, length: int, where: tuple[int, int, int]
+) -> Iterator[str]:
+    """Scalars, and the entries of arrays that belong to the element, its thread, or the point its thread works on."""
+    element, thread, point = where
     for name, value in zip(names, values, strict=False):
         if isinstance(value, (bool, int, float)):
             yield f"{name} = {value:g}"
-    for name, array in arrays:
+    for name, array in _arrays(names[: len(values)], values):
         at = point if name.startswith("points.") else element if len(array) == length else thread
         if 0 <= at < len(array) and (name.startswith("points.") or len(array) in (length, count)):
             yield f"{name}[{at}] = {_text(np.atleast_1d(array.numpy()[at]).ravel())}"
