@@ -66,7 +66,7 @@ def _small_objects(scene: Scene) -> Scene:
     """A ball of 12 cm on the floor, and one far from it under the ceiling: the volume is large, a ball a few voxels."""
     real = tuple(m for m in scene.meshes if m.role == Role.REAL)
     material = int(next(m for m in scene.meshes if m.role == Role.SYNTHETIC).materials[0])
-    places = (np.array([0.1, 0.06, 0.3]), np.array([1.6, 2.0, -1.8]))
+    places = (np.array([0.2, 0.06, -0.4]), np.array([1.6, 2.0, -1.6]))
     balls = tuple(ball(place, 0.06, 2000, material) for place in places)
     return replace(scene, meshes=(*real, *balls))
 
