@@ -20,6 +20,7 @@ from warp_dvct.passes.difference import tonemap_difference
 from warp_dvct.passes.lens import LensView
 from warp_dvct.plan import Plan, make_plan
 from warp_dvct.scene import Notice, Role, Scene
+from warp_dvct.scene_check import check_scene
 from warp_dvct.settings import make_settings
 
 if TYPE_CHECKING:
@@ -100,6 +101,7 @@ class Relighter:
         """Read the stage at another time code; what did not change stays on the device."""
         start = clock.perf_counter()
         if isinstance(self._stage, Scene):
+            check_scene(self._stage)
             self.scene = self._stage
         else:
             from warp_dvct.usd.read import read_stage

@@ -86,6 +86,15 @@ def test_a_spill_that_was_not_there_before_is_named():
     assert len(new_spills(spilled, "")) == len(ARCHITECTURES)  # not in the table: taken to spill nothing
 
 
+def test_functions_that_are_not_inlined_count_with_their_kernel():
+    """ptxas lists them after the kernel that calls them, with their spills but no registers of their own."""
+    function = """
+ptxas info    : Function properties for _ZN1_a44_trace_pair_0E17Geometry
+    16 bytes stack frame, 100 bytes spill stores, 50 bytes spill loads
+"""
+    assert parse_usage(REPORT.format(stack=4, spill=1) + function)["_splat"] == Usage(96, 152, 20, 1024)
+
+
 def test_a_broken_table_is_an_error():
     lines = format_usage(usage_of(8)).splitlines()
     with pytest.raises(FileError, match="row 3"):
