@@ -14,6 +14,7 @@ from warp_dvct.kernels.geometry import (
     trace_real,
     trace_synthetic,
 )
+from warp_dvct.kernels.glossy_hits import GlossyHits, Sent, focused
 from warp_dvct.kernels.materials import (
     Surface,
     fresnel,
@@ -135,16 +136,15 @@ def radiosity_at(world: World, position: wp.vec3, normal: wp.vec3, footprint: fl
 
 @wp.func
 def hit_incident(
-    world: World, geo: Geometry, real: Hit, origin: wp.vec3, direction: wp.vec3, solid_angle: float
+    world: World, real: Hit, synthetic: Hit, origin: wp.vec3, direction: wp.vec3, solid_angle: float
 ) -> Incident:
     """Light along an exact ray, before and after: the hit voxel's radiosity, or the environment's.
 
-    ``real`` is what the ray meets in the real scene.
+    ``real`` is what the ray meets in the real scene, ``synthetic`` the synthetic surface before that.
     """
     result = Incident()
     result.before = wp.vec3(0.0, 0.0, 0.0)
     result.after = wp.vec3(0.0, 0.0, 0.0)
-    synthetic = trace_synthetic(geo, origin, direction, real.t)
     width = wp.sqrt(solid_angle)
     if real.found != 0:
         n = world.normals[real.triangle]
@@ -166,7 +166,41 @@ def hit_incident(
 @wp.func
 def ray_incident(world: World, geo: Geometry, origin: wp.vec3, direction: wp.vec3, solid_angle: float) -> Incident:
     """As ``hit_incident``, for a ray that nobody has traced yet."""
-    return hit_incident(world, geo, trace_real(geo, origin, direction, FAR), origin, direction, solid_angle)
+    real = trace_real(geo, origin, direction, FAR)
+    synthetic = trace_synthetic(geo, origin, direction, real.t)
+    return hit_incident(world, real, synthetic, origin, direction, solid_angle)
+
+
+@wp.func
+def focused_incident(
+    light: Incident,
+    hits: GlossyHits,
+    geo: Geometry,
+    world: World,
+    real: Hit,
+    synthetic: Hit,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    solid_angle: float,
+    sample: int,
+) -> Incident:
+    """``light``, with what glossy surfaces send along the ray put right."""
+    result = light
+    even = Sent()
+    even.before = light.before
+    even.after = light.after
+    if real.found != 0:
+        if hits.focuses[geo.material[real.triangle]] != 0:
+            sent = focused(hits, geo, world.env, real, origin, direction, solid_angle, even, 1, sample)
+            result.before = sent.before
+            result.after = sent.after
+    if synthetic.found != 0:
+        result.after = light.after
+        if hits.focuses[geo.material[synthetic.triangle]] != 0:
+            even.before = light.after
+            sent = focused(hits, geo, world.env, synthetic, origin, direction, solid_angle, even, 0, sample)
+            result.after = sent.after
+    return result
 
 
 @wp.func
@@ -267,6 +301,7 @@ def _gather_rays(
     index_in: wp.array(dtype=wp.int32),
     geo: Geometry,
     world: World,
+    hits: GlossyHits,
     rays: int,
     stride: int,
     seed: int,
@@ -277,7 +312,8 @@ def _gather_rays(
 ):
     """Irradiance [W m^-2] from indirect light and domes, by cosine-distributed exact rays (eq. 6's integral).
 
-    ``stride`` is the spacing of the gathered points in pixels. ``nearness_out`` is the mean inverse distance of what the rays met.
+    ``stride`` is the spacing of the gathered points in pixels. ``nearness_out`` is the mean inverse distance of what
+    the rays met.
     """
     i = first + wp.tid()
     j = index_in[i]
@@ -298,7 +334,12 @@ def _gather_rays(
                 if wp.dot(direction, s.normal_g) > 0.0:
                     origin = spawn_point(s, direction)
                     real = kept_real(kept_out, known, i * rays + k, geo, origin, direction)
-                    light = hit_incident(world, geo, real, origin, direction, solid_angle)
+                    synthetic = trace_synthetic(geo, origin, direction, real.t)
+                    light = hit_incident(world, real, synthetic, origin, direction, solid_angle)
+                    if hits.present != 0:
+                        light = focused_incident(
+                            light, hits, geo, world, real, synthetic, origin, direction, solid_angle, start + k
+                        )
                     before += light.before
                     after += light.after
                     nearness += 1.0 / wp.max(wp.min(light.distance_before, light.distance_after), 1.0e-6)

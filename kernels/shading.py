@@ -20,9 +20,10 @@ from warp_dvct.kernels.materials import (
     brdf_cos_specular,
     ggx_d,
     ggx_root,
+    ggx_sample_half,
     spawn_point,
 )
-from warp_dvct.kernels.sampling import PI, sobol2
+from warp_dvct.kernels.sampling import PI, sobol2, tangent_of
 from warp_dvct.kernels.volume import Volume
 
 wp.set_module_options({"enable_backward": False})
@@ -55,13 +56,27 @@ def vndf_pdf(s: Surface, wo: wp.vec3, wi: wp.vec3) -> float:
 
 
 @wp.func
+def reflect_visible(s: Surface, wo: wp.vec3, xi: wp.vec2) -> wp.vec3:
+    """The mirror direction of a visible microfacet."""
+    t = tangent_of(s.normal)
+    b = wp.cross(s.normal, t)
+    h = ggx_sample_half(wp.vec3(wp.dot(wo, t), wp.dot(wo, b), wp.dot(wo, s.normal)), s.alpha, xi)
+    half = t * h[0] + b * h[1] + s.normal * h[2]
+    return wp.normalize(half * (2.0 * wp.dot(wo, half)) - wo)
+
+
+@wp.func
+def power_share(a: float, b: float) -> float:
+    """Power heuristic: the share of the sampler of density ``a`` beside one of density ``b``."""
+    return a * a / (a * a + b * b)
+
+
+@wp.func
 def highlight_weight(s: Surface, wo: wp.vec3, light: LightSample, direct: Direct) -> float:
     """Power-heuristic share of a light sample in the highlight; the specular pass's rays have the rest."""
     if direct.glossy == 0 or s.alpha > direct.alpha_max or light.pdf <= 0.0:
         return 1.0
-    a = float(direct.samples) * light.pdf
-    b = float(direct.glossy) * vndf_pdf(s, wo, light.direction)
-    return a * a / (a * a + b * b)
+    return power_share(float(direct.samples) * light.pdf, float(direct.glossy) * vndf_pdf(s, wo, light.direction))
 
 
 @wp.func

@@ -22,12 +22,11 @@ from warp_dvct.kernels.materials import (
     brdf_cos_diffuse,
     brdf_cos_specular,
     fresnel,
-    ggx_sample_half,
     spawn_point,
     surface_at,
 )
-from warp_dvct.kernels.sampling import INV_PI, sobol2, tangent_of
-from warp_dvct.kernels.shading import SHADOW_END, vndf_pdf
+from warp_dvct.kernels.sampling import INV_PI, sobol2
+from warp_dvct.kernels.shading import SHADOW_END, power_share, reflect_visible, vndf_pdf
 
 wp.set_module_options({"enable_backward": False})
 
@@ -49,12 +48,6 @@ class Glossy:
 
 
 @wp.func
-def power_share(a: float, b: float) -> float:
-    """Power heuristic: the share of the sampler of density ``a`` beside one of density ``b``."""
-    return a * a / (a * a + b * b)
-
-
-@wp.func
 def lights_along(
     lights: Lights, origin: wp.vec3, direction: wp.vec3, reach: float, density: float, samples: float, with_added: int
 ) -> wp.vec3:
@@ -66,16 +59,6 @@ def lights_along(
             if met.pdf > 0.0 and met.distance < reach:
                 total += met.radiance * power_share(density, samples * met.pdf)
     return total
-
-
-@wp.func
-def reflect_visible(s: Surface, wo: wp.vec3, xi: wp.vec2) -> wp.vec3:
-    """The mirror direction of a visible microfacet."""
-    t = tangent_of(s.normal)
-    b = wp.cross(s.normal, t)
-    h = ggx_sample_half(wp.vec3(wp.dot(wo, t), wp.dot(wo, b), wp.dot(wo, s.normal)), s.alpha, xi)
-    half = t * h[0] + b * h[1] + s.normal * h[2]
-    return wp.normalize(half * (2.0 * wp.dot(wo, half)) - wo)
 
 
 @wp.func

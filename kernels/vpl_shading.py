@@ -21,8 +21,8 @@ from warp_dvct.kernels.materials import (
     surface_at,
 )
 from warp_dvct.kernels.sampling import INV_PI, sobol2, uniform1
-from warp_dvct.kernels.shading import Direct, reflected, vndf_pdf
-from warp_dvct.kernels.specular import Glossy, lights_along, reflect_visible
+from warp_dvct.kernels.shading import Direct, reflect_visible, reflected, vndf_pdf
+from warp_dvct.kernels.specular import Glossy, lights_along
 from warp_dvct.kernels.vpls import SKY, Vpls
 
 wp.set_module_options({"enable_backward": False})

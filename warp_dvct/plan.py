@@ -234,10 +234,9 @@ def _is_glossy(scene: Scene, settings: Settings) -> bool:
     used = {int(i) for mesh in scene.meshes for i in np.unique(mesh.materials)}
     for index in used:
         material = scene.materials[index]
-        shines = material.ior != 1.0 or material.metallic > 0.0
-        if material.specular_color is not None:
-            shines = max(material.specular_color) > 0.0
-        if shines and (material.roughness_texture is not None or material.roughness <= settings.glossy_roughness):
+        if material.reflects and (
+            material.roughness_texture is not None or material.roughness <= settings.glossy_roughness
+        ):
             return True
     return False
 

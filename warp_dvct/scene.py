@@ -91,6 +91,13 @@ class Material:
     roughness_texture: int | None = None
     name: str = ""
 
+    @property
+    def reflects(self) -> bool:
+        """Whether it has a specular lobe."""
+        if self.specular_color is not None:
+            return max(self.specular_color) > 0.0
+        return self.ior != 1.0 or self.metallic > 0.0
+
 
 @dataclass(frozen=True)
 class Mesh:

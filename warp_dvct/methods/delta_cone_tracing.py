@@ -27,6 +27,7 @@ from warp_dvct.passes.gather import (
     Gatherer,
     gather_all,
     gather_sparse,
+    glossy_hits,
     keep_rays,
     merge,
     shade_indirect,
@@ -136,6 +137,7 @@ def render(
     hidden_before = launcher.zeros(max(1, buffer.behind_count), wp.vec3)
     if plan.changes or with_before:
         rays = _kept_rays(launcher, scene, plan, kept) if _has_indirect(scene, plan) else None
+        hits = glossy_hits(launcher, scene, device_scene, light_field.bounces, settings.seed)
         parts = [_Part(buffer.points, buffer.count, light, before, with_before)]
         if with_before:
             spare = launcher.zeros(max(1, buffer.behind_count), wp.vec3)
@@ -145,7 +147,7 @@ def render(
                 _shade_direct(launcher, scene, device_scene, plan, world, part)
             if _has_indirect(scene, plan):
                 with launcher.scope("gather"):
-                    irradiance = _irradiance(launcher, device_scene, plan, world, buffer, part, rays)
+                    irradiance = _irradiance(launcher, device_scene, plan, world, hits, buffer, part, rays)
                     shade_indirect(
                         launcher,
                         part.points,
@@ -364,6 +366,7 @@ def _irradiance(
     scene: DeviceScene,
     plan: Plan,
     world: Any,
+    hits: Any,
     buffer: GBuffer,
     part: _Part,
     rays: Any,
@@ -373,15 +376,12 @@ def _irradiance(
     cone = None
     if settings.gather == "cones":
         cone = _cone(plan, math.radians(settings.cones_aperture))
-    real = Gatherer(scene, world, settings.gather_rays, settings.seed, settings.cones_count, cone, part.with_before)
+    shared = settings.seed, settings.cones_count, cone, part.with_before, hits
+    real = Gatherer(scene, world, settings.gather_rays, *shared)
     if part.points is not buffer.points:
-        fewer = Gatherer(
-            scene, world, max(1, settings.gather_rays // 4), settings.seed, settings.cones_count, cone, part.with_before
-        )
+        fewer = Gatherer(scene, world, max(1, settings.gather_rays // 4), *shared)
         return gather_all(launcher, part.points, part.count, fewer)
-    synthetic = Gatherer(
-        scene, world, settings.gather_object_rays, settings.seed, settings.cones_count, cone, part.with_before
-    )
+    synthetic = Gatherer(scene, world, settings.gather_object_rays, *shared)
     before, after = gather_sparse(
         launcher,
         buffer,

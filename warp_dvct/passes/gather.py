@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import gather as kernels
 from warp_dvct.kernels import reconstruction
+from warp_dvct.kernels.glossy_hits import FOCUSING, GlossyHits
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.gbuffer import GBuffer, compact
-from warp_dvct.scene import Role
+from warp_dvct.scene import Material, Role, Scene
 
 PLANE_TOLERANCE = 0.5  # distance off the tangent plane, in gather strides, at which a gathered point counts 1/e
 NORMAL_SHARPNESS = 8.0  # exponent of the normals' cosine
@@ -21,7 +23,10 @@ SMOOTH_REACH = 0.25  # smoothing distance over the harmonic mean distance to the
 
 @dataclass(frozen=True)
 class Gatherer:
-    """How irradiance is gathered at a list of points: exact rays, or cones where ``cone`` is given."""
+    """How irradiance is gathered at a list of points: exact rays, or cones where ``cone`` is given.
+
+    ``hits``: ``GlossyHits`` (:func:`glossy_hits`), for rays; None where surfaces met are taken as Lambertian.
+    """
 
     scene: DeviceScene
     world: Any
@@ -30,6 +35,7 @@ class Gatherer:
     cones: int = 0
     cone: Any = None
     with_before: bool = True
+    hits: Any = None
 
     def run(
         self,
@@ -45,7 +51,8 @@ class Gatherer:
         """Irradiance [W m^-2] before and after at points ``index`` (-1 gives 0): two vec3 ``[count]``.
 
         ``nearness``, float ``[count]``, receives the mean inverse distance of what rays met (cones leave it alone).
-        ``stride``: Spacing of the points in pixels. ``kept``: ``KeptRays`` of ``count`` slots (:func:`keep_rays`), for pixels' centres on real surfaces.
+        ``stride``: Spacing of the points in pixels. ``kept``: ``KeptRays`` of ``count`` slots (:func:`keep_rays`), for
+        pixels' centres on real surfaces.
         """
         if nearness is None:
             nearness = launcher.empty(max(1, count), wp.float32)
@@ -60,6 +67,7 @@ class Gatherer:
                     index,
                     self.scene.geometry,
                     self.world,
+                    self.hits or GlossyHits(),
                     self.rays,
                     stride,
                     self.seed,
@@ -94,6 +102,27 @@ def keep_rays(launcher: Launcher, slots: int, rays: int) -> Any:
     kept.reach = launcher.empty(max(1, slots * rays), wp.float32)
     kept.triangle = launcher.empty(max(1, slots * rays), wp.int32)
     return kept
+
+
+def glossy_hits(launcher: Launcher, scene: Scene, device_scene: DeviceScene, bounces: Any, seed: int) -> Any:
+    """``GlossyHits``, or None where no material sends light to places rather than all around.
+
+    Args:
+        bounces: ``BounceField``.
+    """
+    focuses = np.array([_focuses(material) for material in scene.materials], np.int32)
+    if not focuses.any():
+        return None
+    hits = GlossyHits()
+    hits.present, hits.seed = 1, seed
+    hits.mats, hits.lights, hits.bounces = device_scene.materials, device_scene.lights, bounces
+    hits.focuses = launcher.array(focuses, wp.int32)
+    return hits
+
+
+def _focuses(material: Material) -> bool:
+    narrow = material.roughness_texture is not None or material.roughness**2 <= FOCUSING
+    return narrow and material.reflects
 
 
 def gather_sparse(

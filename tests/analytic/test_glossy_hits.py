@@ -1,0 +1,75 @@
+"""What glossy surfaces send onto others, against the path tracer: it goes where the lobe points, and none is made."""
+
+from __future__ import annotations
+
+import lit_scenes as lit
+import numpy as np
+import pytest
+
+from warp_dvct.methods.path_tracing import gather_irradiance_reference
+from warp_dvct.passes.bounces import bounce_field
+from warp_dvct.passes.gather import Gatherer, gather_all, glossy_hits
+from warp_dvct.passes.injection import empty_flux, inject
+from warp_dvct.passes.rsm import render_rsm
+from warp_dvct.scene import Light, LightKind, Material, Role, Scene
+
+COUNT = 240
+
+
+def glossy_room(roughness: float) -> Scene:
+    """A lamp above a floor that mostly reflects, a back wall that it shines on, and an object in the way."""
+    floor = lit.rectangle((0.5, 0.2, 0.5), (0.4, 0, 0), (0, 0, -0.4))
+    wall = lit.rectangle((0.5, 0.5, 0.15), (0.35, 0, 0), (0, 0.3, 0))
+    lamp = Light(
+        LightKind.RECT,
+        (30.0, 30.0, 30.0),
+        position=(0.5, 0.75, 0.8),
+        axis_x=(0.06, 0, 0),
+        axis_y=(0, 0.04, 0.04),
+        direction=(0, -np.sqrt(0.5), -np.sqrt(0.5)),
+    )
+    materials = [
+        Material((0.1, 0.1, 0.1), roughness=roughness, specular_color=(0.5, 0.4, 0.3)),
+        Material((0.6, 0.6, 0.6), ior=1.0),
+    ]
+    box = lit.mesh(lit.cuboid((0.62, 0.27, 0.5), (0.05, 0.06, 0.05), 20.0), Role.SYNTHETIC, 1)
+    return lit.scene_of(
+        lit.mesh(floor, material=0), lit.mesh(wall, material=1), box, lights=(lamp,), materials=materials
+    )
+
+
+def irradiance(launcher, scene, roughness_hits: bool, positions, normals):
+    def flux_of(device_scene, voxels):
+        maps = render_rsm(launcher, device_scene, 0, 384, center=(0.5, 0.5, 0.5), radius=0.87, start=3.0)
+        flux = empty_flux(launcher, voxels)
+        inject(launcher, voxels, maps, flux)
+        return flux
+
+    world = lit.lit_world(launcher, scene, 96, flux_of)
+    hits = glossy_hits(launcher, scene, world.device_scene, bounce_field(launcher, None), 0) if roughness_hits else None
+    points = lit.points_at(launcher, positions, normals)
+    gatherer = Gatherer(world.device_scene, world.world, 1024, 3, hits=hits)
+    return [a.numpy()[: len(positions)].astype(float) for a in gather_all(launcher, points, len(positions), gatherer)]
+
+
+@pytest.mark.parametrize(("roughness", "most", "evenly"), [(0.2, 0.32, 1.0), (0.4, 0.06, 0.4)])
+def test_a_glossy_floor_lights_the_wall_that_its_lobe_points_at(launcher, roughness, most, evenly):
+    """Before and after, RMS over the wall's mean: what widening a narrow lobe costs, and what it costs to spread the
+    light evenly, as if the floor were matt. The mean stays."""
+    scene = glossy_room(roughness)
+    rng = np.random.default_rng(5)
+    positions = np.stack([0.2 + 0.6 * rng.random(COUNT), 0.22 + 0.5 * rng.random(COUNT), np.full(COUNT, 0.15)], -1)
+    normals = np.broadcast_to([0.0, 0.0, 1.0], (COUNT, 3))
+    device_scene = lit.upload(launcher, scene)
+    truth = gather_irradiance_reference(launcher, device_scene, scene, positions, normals, samples=4096)
+    right = irradiance(launcher, scene, True, positions, normals)
+    even = irradiance(launcher, scene, False, positions, normals)
+    for got, spread, expected in zip(right, even, truth, strict=True):
+        mean = expected.mean()
+        np.testing.assert_allclose(got.mean(0), expected.mean(0), rtol=0.06)
+        assert np.sqrt(((got - expected) ** 2).mean()) / mean < most
+        assert np.sqrt(((spread - expected) ** 2).mean()) / mean > evenly
+
+
+def test_matt_scenes_need_none_of_it(launcher):
+    assert glossy_hits(launcher, glossy_room(0.9), lit.upload(launcher, glossy_room(0.9)), None, 0) is None
