@@ -108,23 +108,28 @@ def first_sample(samples: int, share: int, stride: int, points: Points, i: int) 
 def store_hit(
     geo: Geometry, mats: Materials, hit: Hit, origin: wp.vec3, direction: wp.vec3, spread: float, i: int, points: Points
 ):
-    """``spread`` is the size of a pixel at distance 1."""
-    points.role[i] = BACKGROUND
-    points.triangle[i] = -1
-    points.view[i] = -direction
+    """Write all of a point but where it is in the picture. ``spread`` is the size of a pixel at distance 1."""
+    s = Surface()
+    role = BACKGROUND
+    triangle = int(-1)
+    footprint = float(0.0)
     if hit.found != 0:
         s = surface_at(geo, mats, hit, origin, direction)
-        points.role[i] = wp.where(hit.synthetic != 0, SYNTHETIC, REAL)
-        points.triangle[i] = hit.triangle
-        points.position[i] = s.position
-        points.normal_g[i] = s.normal_g
-        points.normal[i] = s.normal
-        points.base_color[i] = s.base_color
-        points.diffuse[i] = s.diffuse
-        points.f0[i] = s.f0
-        points.lobe[i] = wp.vec2(s.f90, s.alpha)
-        points.reach[i] = s.reach
-        points.footprint[i] = hit.t * spread
+        role = wp.where(hit.synthetic != 0, SYNTHETIC, REAL)
+        triangle = hit.triangle
+        footprint = hit.t * spread
+    points.role[i] = role
+    points.triangle[i] = triangle
+    points.view[i] = -direction
+    points.position[i] = s.position
+    points.normal_g[i] = s.normal_g
+    points.normal[i] = s.normal
+    points.base_color[i] = s.base_color
+    points.diffuse[i] = s.diffuse
+    points.f0[i] = s.f0
+    points.lobe[i] = wp.vec2(s.f90, s.alpha)
+    points.reach[i] = s.reach
+    points.footprint[i] = footprint
 
 
 @wp.func

@@ -153,7 +153,7 @@ def focused(
     specular = hemispherical_albedo_specular(s)
     keep = divided(diffuse, diffuse + specular)
     bounced = bounced_irradiance(hits.bounces, s.position, s.normal_g)
-    s.alpha = wp.sqrt(s.alpha * s.alpha + solid_angle / PI)
+    s.alpha = wp.min(wp.sqrt(s.alpha * s.alpha + solid_angle / PI), 1.0)
     share = divided(specular, hemispherical_albedo_specular(s))  # widening costs energy at grazing angles
     brightest = wp.max(even.after, even.before)
     faint = NEGLIGIBLE / PI * wp.max(brightest[0], wp.max(brightest[1], brightest[2]))

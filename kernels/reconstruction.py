@@ -48,7 +48,6 @@ class Guide:
     rows: wp.int32
     radius: wp.int32  # blocks to each side
     plane: wp.float32  # tolerated distance off the tangent plane, in pixel footprints times stride
-    sharpness: wp.float32  # exponent of the normals' cosine
     reach: wp.float32  # smoothing: tolerated distance over the mean distance of the surfaces around
 
 
@@ -61,7 +60,9 @@ def same_surface(points: Points, i: int, j: int, guide: Guide) -> float:
     offset = points.position[j] - points.position[i]
     gap = wp.max(wp.abs(wp.dot(offset, points.normal_g[i])), wp.abs(wp.dot(offset, points.normal_g[j])))
     gap = gap / (guide.plane * float(guide.stride) * points.footprint[i])
-    return wp.pow(facing, guide.sharpness) * wp.exp(-gap * gap)
+    square = facing * facing
+    fourth = square * square
+    return fourth * fourth * wp.exp(-gap * gap)
 
 
 @wp.kernel
@@ -71,6 +72,7 @@ def _smooth(
     choice_in: wp.array(dtype=wp.int32),
     guide: Guide,
     spacing: int,
+    mark_in: wp.array(dtype=wp.int32),
     before_in: wp.array(dtype=wp.vec3),
     after_in: wp.array(dtype=wp.vec3),
     nearness_in: wp.array(dtype=wp.float32),
@@ -78,13 +80,14 @@ def _smooth(
     after_out: wp.array(dtype=wp.vec3),
 ):
     """One a-trous step over the gathered points: an average of those on the same surface, as far as irradiance can be
-    smooth there, that is over a share of the harmonic mean distance to what they see (Ward et al. 1988)."""
+    smooth there, that is over a share of the harmonic mean distance to what they see (Ward et al. 1988). Blocks that
+    ``mark_in`` does not mark stay as they are."""
     i = first + wp.tid()
     at = choice_in[i]
     total = float(1.0)
     before = before_in[i]
     after = after_in[i]
-    if at >= 0:
+    if at >= 0 and mark_in[i] != 0:
         cx = i % guide.columns
         cy = i / guide.columns
         position = points.position[at]
@@ -108,6 +111,100 @@ def _smooth(
     after_out[i] = after / total
 
 
+@wp.struct
+class Interpolated:
+    before: wp.vec3
+    after: wp.vec3
+    missing: wp.int32  # 1: no gathered point lies on the same surface
+
+
+@wp.func
+def interpolated(
+    points: Points,
+    i: int,
+    width: int,
+    guide: Guide,
+    choice_in: wp.array(dtype=wp.int32),
+    before_in: wp.array(dtype=wp.vec3),
+    after_in: wp.array(dtype=wp.vec3),
+) -> Interpolated:
+    """Mean of the points gathered around, weighted by distance in the picture, plane and normal."""
+    result = Interpolated()
+    px = float(points.pixel[i][0]) + 0.5
+    py = float(points.pixel[i][1]) + 0.5
+    stride = float(guide.stride)
+    cx = int(wp.floor(px / stride))
+    cy = int(wp.floor(py / stride))
+    extent = float(guide.radius) + 0.5
+    total = float(0.0)
+    before = wp.vec3(0.0, 0.0, 0.0)
+    after = wp.vec3(0.0, 0.0, 0.0)
+    for by in range(wp.max(cy - guide.radius, 0), wp.min(cy + guide.radius, guide.rows - 1) + 1):
+        for bx in range(wp.max(cx - guide.radius, 0), wp.min(cx + guide.radius, guide.columns - 1) + 1):
+            block = by * guide.columns + bx
+            j = choice_in[block]
+            if j >= 0:
+                dx = (float(j % width) + 0.5 - px) / stride
+                dy = (float(j / width) + 0.5 - py) / stride
+                near = wp.max(0.0, 1.0 - (dx * dx + dy * dy) / (extent * extent))
+                if near > 0.0:
+                    weight = near * near * same_surface(points, i, j, guide)
+                    if weight > 1.0e-4:
+                        total += weight
+                        before += before_in[block] * weight
+                        after += after_in[block] * weight
+    if total > 1.0e-3:
+        result.before = before / total
+        result.after = after / total
+    else:
+        result.missing = 1
+    return result
+
+
+@wp.kernel
+def _find_detail(
+    first: int,
+    points: Points,
+    width: int,
+    fine_columns: int,
+    fine_choice_in: wp.array(dtype=wp.int32),
+    guide: Guide,
+    choice_in: wp.array(dtype=wp.int32),
+    nearness_in: wp.array(dtype=wp.float32),
+    before_in: wp.array(dtype=wp.vec3),
+    after_in: wp.array(dtype=wp.vec3),
+    limit: float,
+    mark_out: wp.array(dtype=wp.int32),
+    nearness_out: wp.array(dtype=wp.float32),
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+):
+    """Where blocks of half the stride have to be gathered, and the interpolated irradiance of the others.
+
+    By the split-sphere bound on how fast irradiance can change (Ward et al. 1988): the way to the point gathered in the
+    block (half a block at least), over the harmonic mean distance of what that saw, plus the turn of the normal.
+    """
+    i = first + wp.tid()
+    j = fine_choice_in[i]
+    mark = int(0)
+    nearness_out[i] = 0.0
+    before_out[i] = wp.vec3(0.0, 0.0, 0.0)
+    after_out[i] = wp.vec3(0.0, 0.0, 0.0)
+    if j >= 0:
+        block = ((i / fine_columns) / 2) * guide.columns + (i % fine_columns) / 2
+        at = choice_in[block]
+        half = 0.5 * float(guide.stride) * points.footprint[j]
+        way = wp.max(wp.length(points.position[j] - points.position[at]), half) * nearness_in[block]
+        turn = wp.sqrt(wp.max(1.0 - wp.dot(points.normal[j], points.normal[at]), 0.0))
+        found = interpolated(points, j, width, guide, choice_in, before_in, after_in)
+        nearness_out[i] = nearness_in[block]
+        before_out[i] = found.before
+        after_out[i] = found.after
+        if found.missing != 0 or way + turn > limit:
+            mark = 1
+    mark_out[i] = mark
+
+
 @wp.kernel
 def _reconstruct(
     first: int,
@@ -129,36 +226,42 @@ def _reconstruct(
     i = first + wp.tid()
     missing = int(0)
     if points.role[i] == role:
-        pixel = points.pixel[i]
-        px = float(pixel[0]) + 0.5
-        py = float(pixel[1]) + 0.5
-        stride = float(guide.stride)
-        cx = int(wp.floor(px / stride))
-        cy = int(wp.floor(py / stride))
-        extent = float(guide.radius) + 0.5
-        total = float(0.0)
-        before = wp.vec3(0.0, 0.0, 0.0)
-        after = wp.vec3(0.0, 0.0, 0.0)
-        for by in range(wp.max(cy - guide.radius, 0), wp.min(cy + guide.radius, guide.rows - 1) + 1):
-            for bx in range(wp.max(cx - guide.radius, 0), wp.min(cx + guide.radius, guide.columns - 1) + 1):
-                block = by * guide.columns + bx
-                j = choice_in[block]
-                if j >= 0:
-                    dx = (float(j % width) + 0.5 - px) / stride
-                    dy = (float(j / width) + 0.5 - py) / stride
-                    near = wp.max(0.0, 1.0 - (dx * dx + dy * dy) / (extent * extent))
-                    if near > 0.0:
-                        weight = near * near * same_surface(points, i, j, guide)
-                        if weight > 1.0e-4:
-                            total += weight
-                            before += before_in[block] * weight
-                            after += after_in[block] * weight
-        if total > 1.0e-3:
-            before_out[i] = before / total
-            after_out[i] = after / total
-        else:
-            missing = 1
+        found = interpolated(points, i, width, guide, choice_in, before_in, after_in)
+        missing = found.missing
+        if missing == 0:
+            before_out[i] = found.before
+            after_out[i] = found.after
     missing_out[i] = missing
+
+
+@wp.kernel
+def _pick(
+    first: int,
+    listed_in: wp.array(dtype=wp.int32),
+    choice_in: wp.array(dtype=wp.int32),
+    index_out: wp.array(dtype=wp.int32),
+):
+    """The points of listed blocks."""
+    i = first + wp.tid()
+    index_out[i] = choice_in[listed_in[i]]
+
+
+@wp.kernel
+def _put_detail(
+    first: int,
+    listed_in: wp.array(dtype=wp.int32),
+    before_in: wp.array(dtype=wp.vec3),
+    after_in: wp.array(dtype=wp.vec3),
+    found_nearness_in: wp.array(dtype=wp.float32),
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+    nearness_out: wp.array(dtype=wp.float32),
+):
+    """Put what was gathered in listed blocks where they are; every block is listed once."""
+    i = first + wp.tid()
+    before_out[listed_in[i]] = before_in[i]
+    after_out[listed_in[i]] = after_in[i]
+    nearness_out[listed_in[i]] = found_nearness_in[i]
 
 
 @wp.kernel

@@ -212,6 +212,8 @@ def points_at(launcher: Launcher, positions, normals, *, role=0, color=(0.5, 0.5
     points.position = launcher.array(positions, wp.vec3)
     points.normal = points.normal_g = points.view = launcher.array(np.ascontiguousarray(normals), wp.vec3)
     points.base_color = points.diffuse = launcher.full(count, wp.vec3(*color), wp.vec3)
+    points.f0, points.lobe = launcher.zeros(count, wp.vec3), launcher.zeros(count, wp.vec2)
+    points.footprint, points.triangle = launcher.zeros(count, wp.float32), launcher.zeros(count, wp.int32)
     points.reach = launcher.full(count, reach, wp.float32)
     points.pixel = launcher.array(np.stack([np.arange(count)] * 2, -1).astype(np.int32), wp.vec2i)
     points.slot = launcher.full(count, WHOLE, wp.int32)

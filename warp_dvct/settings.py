@@ -55,9 +55,12 @@ class Settings:
 
     gather: str = _knob("rays", "how diffuse indirect light is gathered", choices=("rays", "cones"))
     gather_rays: int = _knob(64, "rays per gather point on real surfaces", low=1, high=65536)
-    gather_stride: int = _knob(6, "pixels between gather points on real surfaces; 1 for every pixel", low=1, high=64)
+    gather_stride: int = _knob(8, "pixels between gather points on real surfaces; 1 for every pixel", low=1, high=64)
     gather_object_rays: int = _knob(64, "rays per gather point on synthetic surfaces", low=1, high=65536)
-    gather_object_stride: int = _knob(3, "pixels between gather points on synthetic surfaces", low=1, high=64)
+    gather_object_stride: int = _knob(4, "pixels between gather points on synthetic surfaces", low=1, high=64)
+    gather_detail: float = _knob(
+        0.25, "bound on the change within a stride beyond which it is halved; 0 for never", low=0.0, high=100.0
+    )
     gather_smoothing: int = _knob(1, "a-trous steps that smooth what rays gathered; 0 for none", low=0, high=6)
     gather_radius: int = _knob(1, "gather points to each side that reconstruction looks at", low=0, high=16)
 
@@ -127,9 +130,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "shadows.samples": 6,
         "shadows.probes": 6,
         "gather.rays": 24,
-        "gather.stride": 8,
+        "gather.detail": 0.0,
         "gather.object_rays": 24,
-        "gather.object_stride": 4,
         "glossy.rays": 2,
         "patches.count": 1024,
         "patches.rays": 32,

@@ -390,6 +390,7 @@ def _irradiance(
         stride=settings.gather_stride,
         radius=settings.gather_radius,
         smoothing=settings.gather_smoothing,
+        detail=settings.gather_detail,
         kept=rays,
     )
     if scene.synthetic is not None:
@@ -401,6 +402,7 @@ def _irradiance(
             stride=settings.gather_object_stride,
             radius=settings.gather_radius,
             smoothing=settings.gather_smoothing,
+            detail=settings.gather_detail,
         )
         merge(launcher, (before, after), (object_before, object_after))
     return before, after

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from warp_dvct.passes.gbuffer import GBuffer, compact
 from warp_dvct.scene import Material, Role, Scene
 
 PLANE_TOLERANCE = 0.5  # distance off the tangent plane, in gather strides, at which a gathered point counts 1/e
-NORMAL_SHARPNESS = 8.0  # exponent of the normals' cosine
+FINEST = 2  # pixels to which details halve the stride
 SMOOTH_REACH = 0.25  # smoothing distance over the harmonic mean distance to the surfaces around
 
 
@@ -125,6 +125,35 @@ def _focuses(material: Material) -> bool:
     return narrow and material.reflects
 
 
+@dataclass(frozen=True)
+class _Grid:
+    """Gathered points: one of each block of ``stride`` x ``stride`` pixels.
+
+    Attributes:
+        choice: int ``[columns * rows]``, the point of each block, or -1.
+        nearness: float, mean inverse distance of what the point saw.
+        before, after: vec3, irradiance.
+    """
+
+    stride: int
+    columns: int
+    rows: int
+    choice: Any
+    nearness: Any
+    before: Any
+    after: Any
+
+    @property
+    def count(self) -> int:
+        return self.columns * self.rows
+
+    def guide(self, radius: int) -> Any:
+        guide = reconstruction.Guide()
+        guide.stride, guide.columns, guide.rows, guide.radius = self.stride, self.columns, self.rows, radius
+        guide.plane, guide.reach = PLANE_TOLERANCE, SMOOTH_REACH
+        return guide
+
+
 def gather_sparse(
     launcher: Launcher,
     buffer: GBuffer,
@@ -134,6 +163,7 @@ def gather_sparse(
     stride: int,
     radius: int,
     smoothing: int = 0,
+    detail: float = 0.0,
     kept: Any = None,
 ) -> tuple[Any, Any]:
     """Irradiance, before and after, at every shading point of a role.
@@ -141,49 +171,97 @@ def gather_sparse(
     One pixel of each ``stride`` x ``stride`` block is gathered; ``smoothing`` a-trous steps average the gathered values
     as far as the distance to what they see allows; the others are reconstructed from the blocks within
     ``radius`` that lie on the same surface. Points without any such block are gathered themselves.
-    ``kept``: ``KeptRays`` with a slot per block, for the role REAL.
+
+    Args:
+        detail: Bound on the relative change of irradiance within a block (Ward et al. 1988) beyond which it is gathered
+            at half the stride; 0 for never.
+        kept: ``KeptRays`` with a slot per block, for the role REAL.
 
     Returns:
         Two vec3 ``[buffer.count]``; 0 at points of the other role.
     """
     columns, rows = -(-buffer.width // stride), -(-buffer.height // stride)
-    choice = launcher.empty(columns * rows, wp.int32)
-    launcher.launch(
-        reconstruction._choose_points,
-        columns * rows,
-        [buffer.points, buffer.width, buffer.height, stride, columns, int(role), gatherer.seed],
-        [choice],
-    )
+    choice = _choose(launcher, buffer, stride, columns, rows, role, gatherer.seed)
     nearness = launcher.zeros(columns * rows, wp.float32)
-    sparse = gatherer.run(launcher, buffer.points, choice, columns * rows, nearness, kept, stride=stride)
-    guide = reconstruction.Guide()
-    guide.stride, guide.columns, guide.rows = stride, columns, rows
-    guide.plane, guide.sharpness, guide.reach = PLANE_TOLERANCE, NORMAL_SHARPNESS, SMOOTH_REACH
-    guide.radius = 2
-    if gatherer.cone is None:
-        for step in range(smoothing):
-            smoothed = launcher.empty(columns * rows, wp.vec3), launcher.empty(columns * rows, wp.vec3)
-            launcher.launch(
-                reconstruction._smooth,
-                columns * rows,
-                [buffer.points, choice, guide, 1 << step, *sparse, nearness],
-                [*smoothed],
-            )
-            sparse = smoothed
-    guide.radius = radius if stride > 1 else min(radius, 1)
+    before, after = gatherer.run(launcher, buffer.points, choice, columns * rows, nearness, kept, stride=stride)
+    grid = _Grid(stride, columns, rows, choice, nearness, before, after)
+    steps = smoothing if gatherer.cone is None else 0
+    grid = _smooth(launcher, buffer, grid, launcher.full(grid.count, 1, wp.int32), steps)
+    while detail > 0.0 and grid.stride > FINEST and grid.stride % 2 == 0 and gatherer.cone is None:
+        grid = _refine(launcher, buffer, role, gatherer, grid, radius, steps, detail)
     before = launcher.zeros(buffer.count, wp.vec3)
     after = launcher.zeros(buffer.count, wp.vec3)
     missing = launcher.empty(buffer.count, wp.int32)
+    guide = grid.guide(radius if grid.stride > 1 else min(radius, 1))
     launcher.launch(
         reconstruction._reconstruct,
         buffer.count,
-        [buffer.points, buffer.width, int(role), guide, choice, *sparse],
+        [buffer.points, buffer.width, int(role), guide, grid.choice, grid.before, grid.after],
         [before, after, missing],
     )
     _, index, left = compact(launcher, missing)
     left_before, left_after = gatherer.run(launcher, buffer.points, index, left)
     launcher.launch(reconstruction._scatter_missing, left, [index, left_before, left_after], [before, after])
     return before, after
+
+
+def _choose(launcher: Launcher, buffer: GBuffer, stride: int, columns: int, rows: int, role: Role, seed: int) -> Any:
+    choice = launcher.empty(columns * rows, wp.int32)
+    launcher.launch(
+        reconstruction._choose_points,
+        columns * rows,
+        [buffer.points, buffer.width, buffer.height, stride, columns, int(role), seed],
+        [choice],
+    )
+    return choice
+
+
+def _smooth(launcher: Launcher, buffer: GBuffer, grid: _Grid, mark: Any, steps: int) -> _Grid:
+    """The grid after ``steps`` a-trous steps over its marked blocks."""
+    for step in range(steps):
+        before, after = launcher.empty(grid.count, wp.vec3), launcher.empty(grid.count, wp.vec3)
+        launcher.launch(
+            reconstruction._smooth,
+            grid.count,
+            [buffer.points, grid.choice, grid.guide(2), 1 << step, mark, grid.before, grid.after, grid.nearness],
+            [before, after],
+        )
+        grid = replace(grid, before=before, after=after)
+    return grid
+
+
+def _refine(
+    launcher: Launcher,
+    buffer: GBuffer,
+    role: Role,
+    gatherer: Gatherer,
+    grid: _Grid,
+    radius: int,
+    smoothing: int,
+    detail: float,
+) -> _Grid:
+    """A grid of half the stride: gathered where ``grid`` cannot tell, interpolated elsewhere."""
+    points, stride = buffer.points, grid.stride // 2
+    columns, rows = -(-buffer.width // stride), -(-buffer.height // stride)
+    count = columns * rows
+    choice = _choose(launcher, buffer, stride, columns, rows, role, gatherer.seed)
+    mark = launcher.empty(count, wp.int32)
+    nearness = launcher.empty(count, wp.float32)
+    before, after = launcher.empty(count, wp.vec3), launcher.empty(count, wp.vec3)
+    coarse = [grid.choice, grid.nearness, grid.before, grid.after]
+    launcher.launch(
+        reconstruction._find_detail,
+        count,
+        [points, buffer.width, columns, choice, grid.guide(radius), *coarse, detail],
+        [mark, nearness, before, after],
+    )
+    _, listed, found = compact(launcher, mark)
+    index = launcher.empty(max(1, found), wp.int32)
+    launcher.launch(reconstruction._pick, found, [listed, choice], [index])
+    near = launcher.empty(max(1, found), wp.float32)
+    gathered = gatherer.run(launcher, points, index, found, near, stride=stride)
+    launcher.launch(reconstruction._put_detail, found, [listed, *gathered, near], [before, after, nearness])
+    return _smooth(launcher, buffer, _Grid(stride, columns, rows, choice, nearness, before, after), mark, smoothing)
 
 
 def gather_all(launcher: Launcher, points: Any, count: int, gatherer: Gatherer) -> tuple[Any, Any]:

@@ -103,10 +103,11 @@ def compact(launcher: Launcher, mark: Any) -> tuple[Any, Any, int]:
 
 
 def new_points(launcher: Launcher, count: int) -> Any:
-    """Zeroed ``Points`` with room for ``count`` entries."""
+    """``Points`` with room for ``count`` entries, which a kernel has yet to write."""
     points = Points()
     for name, variable in Points.vars.items():
-        setattr(points, name, launcher.zeros(max(count, 1), variable.type.dtype))
+        # Cleared, the pages would be touched by one thread alone.
+        setattr(points, name, launcher.empty(max(count, 1), variable.type.dtype))
     return points
 
 
