@@ -38,7 +38,14 @@ def test_origin_far_away(method, shift):
     np.testing.assert_allclose(other.layers.depth, usual.layers.depth, rtol=1e-5)
 
 
-ENOUGH = {"samples": 96, "gather.rays": 64, "gather.object_rays": 64, "shadows.samples": 16, "vpls.count": 256}
+ENOUGH = {
+    "samples": 96,
+    "gather.rays": 64,
+    "gather.object_rays": 64,
+    "shadows.samples": 16,
+    "vpls.count": 256,
+    "vpls.further": 96,
+}
 
 
 @pytest.mark.parametrize("method", METHODS)
