@@ -14,7 +14,9 @@ import numpy as np
 from warp_dvct.capture.intrinsics import Intrinsics
 from warp_dvct.scene import Mesh, Role
 
-OUTER = 0.51  # pixels by which the surface goes on past the outermost pixels' centres: to the image's edge
+ASIDE = np.array([0.017, 0.011])  # pixels off the centres: rays through centres that ran along edges would miss some
+UNDER = 0.25  # pixels that a farther surface goes on below the nearer one's edge
+OUTER = 0.53  # pixels by which a surface goes on past the centres of its outermost pixels: to their edges
 BLOCK = 32  # pixels an edge of the largest pair of triangles
 
 
@@ -77,19 +79,18 @@ def depth_grid(inverse: np.ndarray, normals: np.ndarray, lens: Intrinsics, limit
     number = corners[..., 1] * width + corners[..., 0]
     flat = rho.ravel()
     whole = (flat[number] > 0.0).all(-1)
-    unit = np.ptp(corners, axis=1).max(-1) == 1
-    number, unit = number[whole], unit[whole]
-    number = number[~unit | _one_surface(flat[number], limits)]
-    extra, extra_place, extra_rho, extra_owner = _continued(rho, limits)
+    small = np.ptp(corners, axis=1).max(-1) == 1  # larger ones are in one piece, or they would have been halved
+    number, small = number[whole], small[whole]
+    number = number[~small | _one_surface(flat[number], limits)]
+    extra, extra_pixels, extra_rho, extra_owner = _continued(rho, limits)
     triangles = np.concatenate([number, rho.size + extra])
     # Only what a triangle uses becomes a vertex.
     used, triangles = np.unique(triangles, return_inverse=True)
-    place = np.concatenate([np.arange(rho.size), extra_place])[used]
+    centers = np.stack([np.arange(rho.size) % width, np.arange(rho.size) // width], -1).astype(np.float64)
+    shift, bent = _outward(rho, limits)
+    pixels = np.concatenate([centers + shift.reshape(-1, 2), extra_pixels])[used] + ASIDE
     owner = np.concatenate([np.arange(rho.size), extra_owner])[used]
-    depth = np.concatenate([flat, extra_rho])[used]
-    pixels = np.stack([place % width, place // width], -1).astype(np.float64)
-    edge = np.array(lens.size) - 1
-    pixels += np.where(pixels == 0, -OUTER, np.where(pixels == edge, OUTER, 0.0))
+    depth = np.concatenate([bent.ravel(), extra_rho])[used]
     source = np.minimum(owner // width, lens.height - 1) * lens.width + np.minimum(owner % width, lens.width - 1)
     rays = np.stack([(pixels[:, 0] - lens.cx) / lens.fx, (pixels[:, 1] - lens.cy) / lens.fy, np.ones(len(pixels))], -1)
     normal = normals.reshape(-1, 3)[source].astype(np.float64)
@@ -125,6 +126,7 @@ def _errors(rho: np.ndarray, limits: GridLimits) -> np.ndarray:
         y, x = first_y + margin, first_x + margin
         return error[y : y + step * count[0] : step, x : x + step * count[1] : step]
 
+    torn = _beside_tear(rho, limits)
     for half in _levels():
         step, quarter = 2 * half, half // 2
         corner = rho[::step, ::step]
@@ -132,7 +134,9 @@ def _errors(rho: np.ndarray, limits: GridLimits) -> np.ndarray:
             (rho[::step, half::step], corner[:, :-1], corner[:, 1:], 0, half),
             (rho[half::step, ::step], corner[:-1], corner[1:], half, 0),
         ):
-            found = _middle_error(a, middle, b, half, half, limits)
+            found = _middle_error(a, middle, b, half, limits)
+            if half == 1:
+                found[torn[y::2, x::2]] = np.inf
             if quarter:
                 for dy, dx in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
                     found = np.maximum(found, at(y + dy * quarter, x + dx * quarter, step, found.shape))
@@ -141,22 +145,42 @@ def _errors(rho: np.ndarray, limits: GridLimits) -> np.ndarray:
         falling = _falling(middle.shape)
         a = np.where(falling, corner[:-1, :-1], corner[:-1, 1:])
         b = np.where(falling, corner[1:, 1:], corner[1:, :-1])
-        found = _middle_error(a, middle, b, half, half * np.sqrt(2.0), limits)
+        found = _middle_error(a, middle, b, half * np.sqrt(2.0), limits)
         if half == 1:
-            for side in (rho[::2, 1::2][:-1], rho[::2, 1::2][1:], rho[1::2, ::2][:, :-1], rho[1::2, ::2][:, 1:]):
-                torn = ~limits.joined(side, middle) & ((side > 0.0) | (middle > 0.0))
-                found[torn] = np.inf
+            found[torn[1::2, 1::2]] = np.inf
         for dy, dx in ((-half, 0), (half, 0), (0, -half), (0, half)):
             found = np.maximum(found, at(half + dy, half + dx, step, found.shape))
         at(half, half, step, found.shape)[:] = found
     return error[margin:-margin, margin:-margin]
 
 
-def _middle_error(
-    a: np.ndarray, middle: np.ndarray, b: np.ndarray, half: int, reach: float, limits: GridLimits
-) -> np.ndarray:
-    """Of a middle between the ends of a side, in what is tolerated; infinite where one of the three is unknown or, for
-    neighbours, apart.
+def _beside_tear(rho: np.ndarray, limits: GridLimits) -> np.ndarray:
+    """Pixels with a neighbour to a side that is on another surface, or of which one is unknown."""
+    torn = np.zeros(rho.shape, bool)
+    for one, other in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        apart = ~limits.joined(rho[one], rho[other]) & ((rho[one] > 0.0) | (rho[other] > 0.0))
+        torn[one] |= apart
+        torn[other] |= apart
+    return torn
+
+
+def _outward(rho: np.ndarray, limits: GridLimits) -> tuple[np.ndarray, np.ndarray]:
+    """How far the outermost pixels of a surface move their vertices, ``[h, w, 2]``, towards unknown pixels, farther
+    surfaces and the image's edge; and the inverse depth there, on the line from the pixel on the other side."""
+    shift, bent = np.zeros((*rho.shape, 2)), rho.copy()
+    padded = np.pad(rho, 1)
+    height, width = rho.shape
+    for axis, dx, dy in ((0, 1, 0), (0, -1, 0), (1, 0, 1), (1, 0, -1)):
+        other = padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
+        ends = (rho > 0.0) & (other < rho) & ~limits.joined(rho, other)
+        shift[..., axis] += (dx + dy) * OUTER * ends
+        inner = padded[1 - dy : 1 - dy + height, 1 - dx : 1 - dx + width]
+        bent += np.where(ends & limits.joined(rho, inner), OUTER * (rho - inner), 0.0)
+    return shift, bent
+
+
+def _middle_error(a: np.ndarray, middle: np.ndarray, b: np.ndarray, reach: float, limits: GridLimits) -> np.ndarray:
+    """Of a middle between the ends of a side, in what is tolerated; infinite where one of the three is unknown.
 
     Args:
         reach: Pixels from the middle to the ends. In space the middle lies at the share (1 / a) / (1 / a + 1 / b).
@@ -164,10 +188,7 @@ def _middle_error(
     known = (a > 0.0).astype(np.int8) + (middle > 0.0) + (b > 0.0)
     slide = reach * np.abs(a - b) / np.maximum(a + b, 1e-12)
     error = np.maximum(np.abs(0.5 * (a + b) - middle) / limits.tolerance, slide / limits.slide)
-    error = np.where(known == 3, error, np.where(known == 0, 0.0, np.inf))
-    if half == 1:
-        error[(known == 3) & ~(limits.joined(a, middle) & limits.joined(middle, b))] = np.inf
-    return error
+    return np.where(known == 3, error, np.where(known == 0, 0.0, np.inf))
 
 
 def _falling(shape: tuple[int, ...]) -> np.ndarray:
@@ -200,17 +221,16 @@ def _refined(rho: np.ndarray, split: np.ndarray) -> np.ndarray:
 
 
 def _one_surface(corner: np.ndarray, limits: GridLimits) -> np.ndarray:
-    """Whether the three corners ``[t, 3]`` are neighbours on one surface."""
-    joined = [limits.joined(corner[:, i], corner[:, j]) for i, j in ((0, 1), (1, 2), (2, 0))]
-    return joined[0] & joined[1] & joined[2]
+    """Whether the corners ``[t, 3]`` of the smallest triangles are on one surface, along both sides of one pixel."""
+    return limits.joined(corner[:, 1], corner[:, 2]) & limits.joined(corner[:, 2], corner[:, 0])
 
 
 def _continued(rho: np.ndarray, limits: GridLimits) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Triangles that continue the farther surface below the nearer one's edge.
 
     Returns:
-        Triangles ``[t, 3]`` over new vertices, and of these the pixel, the inverse depth, and the pixel whose surface
-        they are on.
+        Triangles ``[t, 3]`` over new vertices, and of these the pixel coordinates, the inverse depth, and the pixel
+        whose surface they are on.
     """
     number = np.arange(rho.size).reshape(rho.shape)
     quad = np.stack([number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]], -1)
@@ -220,19 +240,22 @@ def _continued(rho: np.ndarray, limits: GridLimits) -> tuple[np.ndarray, np.ndar
     quad, falling = quad[known], falling[known]
     corner = rho.ravel()[quad]
     far = corner.min(-1, keepdims=True)
-    torn = ~limits.joined(corner, np.broadcast_to(far, corner.shape)).all(-1)
+    sides = [limits.joined(corner[:, i], corner[:, j]) for i, j in ((0, 1), (1, 3), (3, 2), (2, 0))]
+    torn = ~np.logical_and.reduce(sides)
     quad, falling, corner, far = quad[torn], falling[torn], corner[torn], far[torn]
     on_far = limits.joined(corner, np.broadcast_to(far, corner.shape))
     mean = (corner * on_far).sum(-1, keepdims=True) / np.maximum(on_far.sum(-1, keepdims=True), 1)
     farthest = np.take_along_axis(quad, corner.argmin(-1)[:, None], 1)
     new = np.arange(4 * len(quad)).reshape(len(quad), 4)
-    triangles = []
-    for fall, rise in (([0, 3, 1], [1, 0, 2]), ([3, 0, 2], [2, 3, 1])):
-        chosen = np.where(falling[:, None], fall, rise)
-        whole = _one_surface(np.take_along_axis(corner, chosen, 1), limits)
-        triangles.append(np.take_along_axis(new, chosen, 1)[~whole])
+    triangles = [
+        np.take_along_axis(new, np.where(falling[:, None], fall, rise), 1)
+        for fall, rise in (([0, 3, 1], [1, 0, 2]), ([3, 0, 2], [2, 3, 1]))
+    ]
     rho_new, owner = np.where(on_far, corner, mean), np.where(on_far, quad, farthest)
-    return np.concatenate(triangles), quad.ravel(), rho_new.ravel(), owner.ravel()
+    pixels = np.stack([quad % rho.shape[1], quad // rho.shape[1]], -1).astype(np.float64)
+    middle = (pixels * on_far[..., None]).sum(1, keepdims=True) / np.maximum(on_far.sum(-1), 1)[:, None, None]
+    pixels += UNDER * np.where(on_far[..., None], 0.0, np.sign(pixels - middle))
+    return np.concatenate(triangles), pixels.reshape(-1, 2), rho_new.ravel(), owner.ravel()
 
 
 def grid_mesh(grid: Grid, pose: np.ndarray, material: int, uvs: np.ndarray | None, path: str) -> Mesh:
