@@ -171,7 +171,7 @@ def test_a_second_object_gets_a_name_of_its_own_and_both_are_relit(tmp_path, roo
     thing = PlacedObject(bunny_model(), height=0.3, color=(0.7, 0.6, 0.5))
     model = read_model(thing.file)
     place_object(scene, tmp_path / "one.usda", spot, thing, model)
-    moved = spots.make_spot(spot.position + [0.3, 0.0, 0.0], spot.normal, spot.forward)
+    moved = spots.make_spot(spot.position + np.array([0.3, 0.0, 0.0]), spot.normal, spot.forward)
     assert place_object(tmp_path / "one.usda", tmp_path / "two.usda", moved, thing, model) == "/Synthetic/bunny_2"
     relighter = Relighter(tmp_path / "two.usda", time=6.0, width=160, quality="draft")
     roles = [m.role for m in relighter.scene.meshes]

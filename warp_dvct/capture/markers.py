@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from warp_dvct.capture.intrinsics import COEFFICIENTS, Intrinsics
-from warp_dvct.capture.spots import Spot, make_spot
+from warp_dvct.capture.spots import Spot, depth_points, known_pose, make_spot, snapped
 from warp_dvct.capture.stage import Capture
 from warp_dvct.capture.tracking import Track
 from warp_dvct.errors import DvctError, OptionError
@@ -129,35 +129,51 @@ def _coefficients(lens: Intrinsics) -> np.ndarray:
     return np.pad(np.asarray(lens.distortion, np.float64), (0, len(COEFFICIENTS) - len(lens.distortion)))
 
 
-def spot_on_marker(capture: Capture, number: int, size: float, dictionary: str = "DICT_4X4_50") -> Spot:
+def spot_on_marker(
+    capture: Capture,
+    number: int,
+    size: float,
+    dictionary: str = "DICT_4X4_50",
+    *,
+    surface: np.ndarray | None = None,
+) -> Spot:
     """The centre of a marker, from all frames that see it; what stands there looks to the marker's lower edge.
 
+    It is moved onto the measured surface: the marker's distance is off by about 1 %, depth by less.
+
+    Args:
+        surface: Points of the fused surface, world metres ``[n, 3]``; None takes depth of the frame that is nearest.
     Raises:
         OptionError: No frame with a pose sees the marker; it lists those that are seen.
     """
-    centers, normals, downs, weights = [], [], [], []
+    found: list[tuple[int, np.ndarray, float]] = []
     others: set[int] = set()
     for index in capture:
         pose, seen = capture.color_pose(index), _seen(capture, index, size, dictionary)
         others |= {s.id for s in seen}
-        for sighting in seen:
-            if sighting.id == number and pose is not None and not sighting.ambiguous:
-                placed = pose @ sighting.pose
-                centers.append(placed[:3, 3])
-                normals.append(placed[:3, 2])
-                downs.append(-placed[:3, 1])
-                weights.append(1.0 / np.linalg.norm(sighting.pose[:3, 3]) ** 2)  # the error grows with distance squared
-    if not centers:
+        found += [
+            (index, pose @ s.pose, float(np.linalg.norm(s.pose[:3, 3])))
+            for s in seen
+            if s.id == number and pose is not None and not s.ambiguous
+        ]
+    if not found:
         listed = ", ".join(map(str, sorted(others))) or "none"
         raise OptionError(
             f"--marker {number} is in no frame with a pose of '{capture.path}' (markers of {dictionary} that are seen:"
             f" {listed}); check --dictionary and --marker-size"
         )
-    weight = np.asarray(weights) / np.sum(weights)
-    center = np.median(centers, axis=0) if len(centers) > 2 else weight @ np.asarray(centers)
-    near = np.linalg.norm(np.asarray(centers) - center, axis=-1)
+    placed, distance = np.array([p for _, p, _ in found]), np.array([d for _, _, d in found])
+    weight = 1.0 / distance**2  # errors grow with the square of the distance
+    center = np.median(placed[:, :3, 3], axis=0) if len(placed) > 2 else weight @ placed[:, :3, 3] / weight.sum()
+    near = np.linalg.norm(placed[:, :3, 3] - center, axis=-1)
     weight = weight * (near <= max(3.0 * float(np.median(near)), 0.25 * size))
-    return make_spot(weight @ centers / weight.sum(), weight @ normals, weight @ downs)
+    mean = np.einsum("i,ijk->jk", weight / weight.sum(), placed)
+    spot = make_spot(mean[:3, 3], mean[:3, 2], -mean[:3, 1])
+    if surface is None:
+        index = found[int(np.argmin(distance))][0]
+        pose = known_pose(capture, index)
+        surface = depth_points(capture.rig.depth, capture.depth(index)) @ pose[:3, :3].T + pose[:3, 3]
+    return snapped(spot, surface, size)
 
 
 def _seen(capture: Capture, index: int, size: float, dictionary: str) -> list[Sighting]:

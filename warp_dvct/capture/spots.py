@@ -18,6 +18,7 @@ PICK_RADIUS = 4.0  # pixels around the picked one in which a depth is looked for
 FIRST_REACH = 0.03  # metres around the picked point to which the first plane is fitted
 OFF_PLANE = 0.015  # metres; what is farther off the first plane is another surface
 LEAST_POINTS = 12
+SAME_WAY = float(np.cos(np.radians(20.0)))  # between a spot's normal and that of the surface it is moved onto
 ROUNDS = 8  # of re-weighting; Tukey's biweight settles in fewer
 
 
@@ -100,6 +101,23 @@ def spot_at_pixel(
     ray = pose[:3, :3] @ _direction(lens, pixel)
     position = eye + ray * (normal @ (offset - eye)) / (normal @ ray)
     return make_spot(position, normal, eye - position, roughness)
+
+
+def snapped(spot: Spot, points: np.ndarray, reach: float) -> Spot:
+    """A spot moved onto the measured surface below it; as it is, where nothing was measured that agrees with it.
+
+    Args:
+        points: Of the surface, world metres ``[n, 3]``.
+        reach: Metres around the spot over which the plane is fitted.
+    """
+    near = points[np.linalg.norm(points - spot.position, axis=-1) < max(reach, FIRST_REACH)]
+    if len(near) < LEAST_POINTS:
+        return spot
+    normal, offset, roughness = fit_plane(near, spot.position, reach, "the spot")
+    normal = normal if normal @ spot.normal > 0.0 else -normal
+    if normal @ spot.normal < SAME_WAY or np.linalg.norm(offset - spot.position) > 2.0 * OFF_PLANE:
+        return spot
+    return make_spot(offset, normal, spot.forward, roughness)
 
 
 def camera_of(capture: Capture, index: int) -> tuple[Intrinsics, np.ndarray]:

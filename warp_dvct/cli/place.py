@@ -63,16 +63,16 @@ def place(
 
     opened = open_stage(stage)
     capture = open_capture(opened, camera=camera)
+    surface = spots.fused_points(opened, capture)
     if pixel is not None:
         index = 0 if frame is None else spots.frame_index(capture, frame)
-        surface = spots.fused_points(opened, capture)
         spot = spots.spot_at_pixel(capture, index, (pixel[0], pixel[1]), reach=reach, surface=surface)
     else:
         from warp_dvct.capture.markers import spot_on_marker
 
         assert marker is not None
         assert marker_size is not None
-        spot = spot_on_marker(capture, marker, marker_size, dictionary)
+        spot = spot_on_marker(capture, marker, marker_size, dictionary, surface=surface)
     if spot.roughness > UNEVEN:
         click.echo(
             f"warp-dvct: warning: the surface there is uneven, {1000 * spot.roughness:.0f} mm rms from a plane",
