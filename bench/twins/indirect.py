@@ -13,12 +13,21 @@ from warp_dvct.bench.twins.stage import Twin
 from warp_dvct.bench.twins.volumes import N, fields, lit
 from warp_dvct.kernels import bounces, cones, gather, reconstruction, specular
 from warp_dvct.kernels.environment import Environment
+from warp_dvct.kernels.gbuffer import Points
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.gather import Gatherer
 from warp_dvct.passes.gbuffer import new_points
 
 COUNT = 64
 CONES, RAYS = 9, 16
+
+
+def blank_points(launcher: Launcher, count: int) -> Any:
+    """``Points`` all zero: of pixel (0, 0), whose samples start the picture's sequence."""
+    points = new_points(launcher, count)
+    for name in Points.vars:
+        getattr(points, name).zero_()
+    return points
 
 
 def places(launcher: Launcher, twin: Twin) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray]:
@@ -28,7 +37,7 @@ def places(launcher: Launcher, twin: Twin) -> tuple[Any, np.ndarray, np.ndarray,
     weights = rng.dirichlet([1.0, 1.0, 1.0], COUNT)
     position = np.einsum("nk,nkx->nx", weights, twin.corners[triangle]).astype(np.float32)
     normal = twin.normals[triangle].astype(np.float32)
-    points = new_points(launcher, COUNT)
+    points = blank_points(launcher, COUNT)
     points.position = launcher.array(position, wp.vec3)
     points.normal = points.normal_g = points.view = launcher.array(normal, wp.vec3)
     points.reach = launcher.array(np.abs(twin.corners[triangle]).max((1, 2)).astype(np.float32), wp.float32)
@@ -217,7 +226,7 @@ def measure_bounces(launcher: Any) -> list[Deviation]:
 
 
 def measure_reconstruction(launcher: Any) -> list[Deviation]:
-    """One a-trous step over gathered points of a bumpy grid."""
+    """One a-trous step over the marked ones of gathered points of a bumpy grid."""
     rng = np.random.default_rng(9)
     columns, rows = 9, 7
     count = columns * rows
@@ -225,19 +234,21 @@ def measure_reconstruction(launcher: Any) -> list[Deviation]:
     place += rng.normal(0, 2e-3, (count, 3))
     normal = rng.normal(0, 0.2, (count, 3)) + np.array([0.0, 0.0, 1.0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    points = new_points(launcher, count)
+    points = blank_points(launcher, count)
     points.position = launcher.array(place.astype(np.float32), wp.vec3)
     points.normal = points.normal_g = launcher.array(normal.astype(np.float32), wp.vec3)
     points.footprint = launcher.full(count, 0.01, wp.float32)
     guide = reconstruction.Guide()
     guide.stride, guide.columns, guide.rows, guide.radius = 6, columns, rows, 2
-    guide.plane, guide.sharpness, guide.reach = 0.5, 8.0, 0.25
+    guide.plane, guide.reach = 0.5, 0.25
+    mark = rng.integers(0, 4, count) > 0
     choice = launcher.array(np.arange(count, dtype=np.int32), wp.int32)
     light, nearness = rng.uniform(0, 3, (count, 3)), rng.uniform(0.3, 2.0, count)
     given = [launcher.array(light.astype(np.float32), wp.vec3)] * 2
     near = launcher.array(nearness.astype(np.float32), wp.float32)
     out = [launcher.empty(count, wp.vec3) for _ in range(2)]
-    launcher.launch(reconstruction._smooth, count, [points, choice, guide, 1, *given, near], out)
+    marked = launcher.array(mark.astype(np.int32), wp.int32)
+    launcher.launch(reconstruction._smooth, count, [points, choice, guide, 1, marked, *given, near], out)
 
     cell = np.stack([np.arange(count) % columns, np.arange(count) // columns], 1)
     close = np.abs(cell[:, None] - cell[None]).max(-1) <= 2
@@ -246,7 +257,7 @@ def measure_reconstruction(launcher: Any) -> list[Deviation]:
     gap = np.maximum(np.abs(np.einsum("ijx,ix->ij", offset, normal)), np.abs(np.einsum("ijx,jx->ij", offset, normal)))
     apart = np.linalg.norm(offset, axis=-1) * np.maximum(nearness[:, None], nearness[None]) / 0.25
     weight = facing**8 * np.exp(-((gap / (0.5 * 6 * 0.01)) ** 2)) * np.exp(-(apart**2)) * close
-    weight = np.where(weight > 1e-3, weight, 0.0)
+    weight = np.where((weight > 1e-3) & mark[:, None], weight, 0.0)
     np.fill_diagonal(weight, 1.0)
     twin = weight @ light / weight.sum(1, keepdims=True)
     return [compare(reconstruction._smooth, "before", out[0].numpy(), twin)]
