@@ -14,7 +14,15 @@ import pytest
 from warp_dvct.image import write_png
 
 ROOT = Path(__file__).parents[2]
-PAGES = ("README.md", "docs/index.md", "docs/usage.md", "docs/layers.md", "docs/reconstruct.md")
+PAGES = (
+    "README.md",
+    "docs/index.md",
+    "docs/usage.md",
+    "docs/layers.md",
+    "docs/reconstruct.md",
+    "docs/numerics.md",
+    "docs/cuda.md",
+)
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)|src=\"([^\"]+)\"")
 SMALL = "-w 32 --quality draft"
