@@ -81,6 +81,8 @@ EFFECTS = (
     Effect("small objects", "room_area", 1, "changed", _small_objects),
 )
 THIN_WALLS = "thin walls"
+LEAK_STOPS = 3.0  # a leak of some percent shows then
+LEAK_PANELS = ("path-trace, 16 spp", "delta-cones", "gather=cones")
 PAPER = {"shadows": "cone", "gather": "cones", "glossy": "cones", **FORMS["paper"]}
 METHODS: dict[str, tuple[str, dict[str, str]]] = {
     "delta-cones": ("delta-cones", {}),
@@ -170,8 +172,14 @@ def measure(
         if options.images is not None:
             _draw_failures(stage, options.images)
     if not options.effects or THIN_WALLS in options.effects:
+        plates: dict[str, np.ndarray] = {}
         for name, (method, settings) in METHODS.items():
-            add({"effect": THIN_WALLS, "method": name, **_leak(method, settings, options)})
+            figures, before = _leak(method, settings, options)
+            add({"effect": THIN_WALLS, "method": name, **figures})
+            plates[name] = before
+        if options.images is not None:
+            shown = [to_display(plates[name], LEAK_STOPS) for name in LEAK_PANELS]
+            write_jpeg(options.images / "failure_thin_walls.jpg", np.concatenate([codes(p) for p in shown], 1))
     return rows
 
 
@@ -231,8 +239,8 @@ def _figures(stage: _Stage, comp: np.ndarray) -> dict[str, float]:
     }
 
 
-def _leak(method: str, settings: dict[str, str], options: EffectOptions) -> dict[str, float]:
-    """Mean indirect light of the dark room of ``thin_wall`` over the lit one's, before, one bounce."""
+def _leak(method: str, settings: dict[str, str], options: EffectOptions) -> tuple[dict[str, float], np.ndarray]:
+    """Mean indirect light of the dark room of ``thin_wall`` over the lit one's, before, one bounce; and the picture."""
     from warp_dvct.relighter import Relighter
 
     scene = read(stage_file("thin_wall"))
@@ -246,7 +254,7 @@ def _leak(method: str, settings: dict[str, str], options: EffectOptions) -> dict
     indirect, x = np.abs(one.plate - direct.plate), one.position[..., 0]
     real = one.mask_synthetic == 0
     lit, dark = indirect[real & (x > WALL)].mean(), indirect[real & (x < -WALL)].mean()
-    return {"error": float(dark / lit), "flip": math.nan, "share": math.nan, "cpu_seconds": seconds}
+    return {"error": float(dark / lit), "flip": math.nan, "share": math.nan, "cpu_seconds": seconds}, one.plate
 
 
 def _draw_failures(stage: _Stage, folder: Path) -> None:

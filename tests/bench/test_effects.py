@@ -85,8 +85,8 @@ def test_a_tiny_run_prints_a_table_and_draws_the_failure(cache, tmp_path):
 
 def test_walls_leak_by_cones_and_not_in_the_truth():
     options = EffectOptions(width=48, quality="draft")
-    truth = module._leak("path-trace", {"samples": "2"}, options)
-    rays, cones = (module._leak("delta-cones", s, options) for s in ({}, {"gather": "cones"}))
+    truth, _ = module._leak("path-trace", {"samples": "2"}, options)
+    (rays, _), (cones, _) = (module._leak("delta-cones", s, options) for s in ({}, {"gather": "cones"}))
     assert truth["error"] == 0.0
     assert rays["error"] < 0.5 * cones["error"]
 
