@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from warp_dvct.bench.error import read, stage_file
-from warp_dvct.budget import LADDERS, Accuracy, class_of, kind_of
+from warp_dvct.budget import CLOSED, LADDERS, Accuracy, class_of, kind_of
 from warp_dvct.errors import OptionError
 from warp_dvct.image import write_text
 from warp_dvct.launch import Launcher
@@ -125,14 +125,15 @@ def _falling(values: np.ndarray) -> np.ndarray:
 def _power_law(
     base: Mapping[str, float], surveys: Mapping[str, Survey], points: Mapping[Any, float], main: int
 ) -> dict[str, float]:
-    """Log FLIP = constant of the class + power * log(mean change over mean picture) + power * log(width / 320)."""
+    """Log FLIP = constants of the classes + power * log(mean change over mean picture) + power * log(width / 320)."""
     stages = list(base)
     columns = [[float(kind_of(surveys[s]) == k) for s in stages] for k in ("diffuse", "glossy")]
+    columns.append([float(surveys[s].met <= CLOSED) for s in stages])
     columns.append([math.log(max(surveys[s].affected * surveys[s].change, 1e-3)) for s in stages])
     matrix, values = np.array(columns).T, np.log([base[s] for s in stages])
-    # A little pull towards no dependence keeps the power sensible where there are few stages.
-    pull = np.array([[0.0, 0.0, 0.3]])
-    found = np.linalg.lstsq(np.vstack([matrix, pull]), np.append(values, 0.0), rcond=None)[0]
+    # A little pull towards no dependence keeps both sensible where there are few stages.
+    pull = np.diag([0.0, 0.0, 0.1, 0.3])[2:]
+    found = np.linalg.lstsq(np.vstack([matrix, pull]), np.append(values, [0.0, 0.0]), rcond=None)[0]
     slopes = []
     for (stage, width, settings), flip in points.items():
         at_main = points.get((stage, main, settings), 0.0)
@@ -143,7 +144,8 @@ def _power_law(
     return {
         "diffuse": float(found[0]) + shift,
         "glossy": (float(found[1]) if any(columns[1]) else float(found[0])) + shift,
-        "change": float(found[2]),
+        "open": float(found[2]),
+        "change": float(found[3]),
         "width": slope,
     }
 

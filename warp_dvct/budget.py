@@ -83,6 +83,7 @@ class Accuracy:
         """FLIP of the balanced preset: by class, powers of the mean change of the picture and of its width."""
         size = max(survey.affected * survey.change, 1e-3)
         power = self.base["width"] * math.log(width / 320.0)
+        power += 0.0 if survey.met > CLOSED else self.base["open"]  # less of the light there is indirect
         return math.exp(self.base[kind_of(survey)] + self.base["change"] * math.log(size) + power)
 
     def error(self, settings: Settings, survey: Survey, width: int) -> float:
