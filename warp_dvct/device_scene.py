@@ -35,6 +35,7 @@ class DeviceScene:
         triangles_vs: Host float32 ``[t, 3, 3]``, corners in volume space; real triangles first, then synthetic ones.
         role, material: Host int32 ``[t]``.
         double_sided: Host int32 ``[t]``: 1 where the stage says so, or where light meets the mesh from behind.
+        scanned: Host int32 ``[t]``: 1 where a triangle stands for a point of a cloud.
         origin: World position of volume space's origin, float64 ``[3]``, metres.
         scale: Volume-space units per metre.
     """
@@ -49,6 +50,7 @@ class DeviceScene:
     role: np.ndarray
     double_sided: np.ndarray
     material: np.ndarray
+    scanned: np.ndarray
     origin: np.ndarray
     scale: float
 
@@ -90,6 +92,7 @@ class DeviceScene:
             role=host.role,
             double_sided=double_sided,
             material=host.material,
+            scanned=host.scanned,
             origin=origin,
             scale=float(scale),
         )
@@ -110,6 +113,7 @@ class _HostTriangles:
     double_sided: np.ndarray
     role: np.ndarray
     mesh: np.ndarray
+    scanned: np.ndarray
     synthetic_first: int
 
     @staticmethod
@@ -137,6 +141,7 @@ class _HostTriangles:
             double_sided=each([np.full(n, m.double_sided) for m, n in zip(meshes, counts, strict=True)]),
             role=each([np.full(n, m.role) for m, n in zip(meshes, counts, strict=True)]),
             mesh=each([np.full(n, i) for i, n in enumerate(counts)]),
+            scanned=each([np.full(n, m.scanned) for m, n in zip(meshes, counts, strict=True)]),
             synthetic_first=sum(n for m, n in zip(meshes, counts, strict=True) if m.role == Role.REAL),
         )
 

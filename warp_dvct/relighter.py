@@ -22,6 +22,7 @@ from warp_dvct.plan import Plan, make_plan
 from warp_dvct.scene import Notice, Role, Scene
 from warp_dvct.scene_check import check_scene
 from warp_dvct.settings import make_settings
+from warp_dvct.surfels import with_surfels
 
 if TYPE_CHECKING:
     from warp_dvct.budget import Choice
@@ -111,9 +112,11 @@ class Relighter:
         self.width, self.height = self._picture_size()
         if self._launcher.checker is not None:
             self._launcher.checker.width, self._launcher.checker.height = self.width, self.height
-        # Behind a lens that bends, a pinhole's picture of another size is drawn.
+        # Point clouds are drawn as surfels; behind a lens that bends, a pinhole's picture of another size is drawn.
         self._lens = LensView.of(self.scene.camera, self.width, self.height)
-        self._drawn = self.scene if self._lens is None else replace(self.scene, camera=self._lens.camera)
+        self._drawn = with_surfels(self.scene)
+        if self._lens is not None:
+            self._drawn = replace(self._drawn, camera=self._lens.camera)
         self._plan(has_plate=self.scene.plate is not None or self._had_plate)
 
     def set_scene(self, scene: Scene) -> None:

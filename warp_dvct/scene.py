@@ -113,6 +113,7 @@ class Mesh:
         corner_uvs: Texture coordinates per corner, float32, ``[t, 3, 2]``; None where nothing needs them.
         corner_colors: Multiplied into the material's base colour, float32 ``[t, 3, 3]``; None for white.
         path: Prim path (of the instance), for messages and statistics.
+        scanned: The triangles stand for the points of a cloud, which imperfect shadow maps take instead of them.
     """
 
     points: np.ndarray
@@ -124,6 +125,7 @@ class Mesh:
     corner_uvs: np.ndarray | None = None
     corner_colors: np.ndarray | None = None
     path: str = ""
+    scanned: bool = False
 
 
 @dataclass(frozen=True)

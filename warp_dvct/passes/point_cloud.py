@@ -57,6 +57,8 @@ def sample_surfaces(
     clouds = []
     for role, low, high in ranges:
         triangles = np.asarray(scene.triangles_vs[low:high], np.float64)
+        # What stands for given points has no area here: the points themselves are drawn from.
+        triangles[scene.scanned[low:high] == 1] = triangles[scene.scanned[low:high] == 1][:, :1]
         dots = _HostDots.gather([c for c in scans if c.role == role], scene, region)
         pieces = _pieces(triangles, low, dots, region, thin=role == Role.REAL)
         count = block * blocks if pieces is not None else 0
