@@ -65,6 +65,10 @@ def test_a_scanned_ball_looks_like_the_ball(method):
     assert np.median((cloud.normal * mesh.normal).sum(-1)[both]) > 0.99
     lit_by = [layers.rgba[..., :3][both].mean() for layers in (cloud, mesh)]
     assert lit_by[0] == pytest.approx(lit_by[1], rel=0.15)
-    shadow = (mesh.delta.mean(-1) < 0.3 * mesh.delta.mean(-1).min()) & (mesh.mask_synthetic == 0) & (cloud.mask_synthetic == 0)
+    shadow = (
+        (mesh.delta.mean(-1) < 0.3 * mesh.delta.mean(-1).min())
+        & (mesh.mask_synthetic == 0)
+        & (cloud.mask_synthetic == 0)
+    )
     assert shadow.sum() > 30
     assert cloud.delta[shadow].mean() == pytest.approx(mesh.delta[shadow].mean(), rel=0.25)

@@ -61,7 +61,7 @@ def test_a_synthetic_scan_shades_the_ground_by_the_share_of_sky_that_it_covers()
     """A disc of radius R at height h takes R² / (R² + h²) of the light of an even sky."""
     left = openness(render(stage_with_a_scanned_disc(4000)))
     covered = 0.25 / (0.25 + 0.09)
-    assert abs(left - (1 - covered)) < 0.075  # maps that blur the rim leave 0.32 of 0.26, give or take 0.005 by the seed
+    assert abs(left - (1 - covered)) < 0.075  # blurred rims leave 0.32 of 0.26, give or take 0.005 by the seed
     assert openness(render(stage_with_a_scanned_disc(0))) > 0.99
 
 
