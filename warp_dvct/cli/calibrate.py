@@ -33,5 +33,7 @@ def calibrate(device: str, threads: int | None, frames: int, seed: int, out: Pat
         f"{file}: fitted to {len(samples) // 2} frames on {model.threads} thread(s) of {model.machine};"
         f" measured over predicted processor time varies by {model.spread:.0%}"
     )
+    if model.threads > 1 and max(model.speedup.values()) < 1.1:
+        click.echo(f"{model.threads} threads were no faster than one: the machine was busy, calibrate again", err=True)
     if model.spread > 0.25:
         click.echo("the machine was busy with other things: calibrate again when it is idle", err=True)
