@@ -10,12 +10,11 @@ import warp as wp
 
 from warp_dvct.capture.fusion import FusedMesh
 from warp_dvct.device_scene import DeviceScene
-from warp_dvct.kernels.gbuffer import REAL, WHOLE
+from warp_dvct.kernels.gbuffer import REAL, WHOLE, Points
 from warp_dvct.kernels.shading import Direct
 from warp_dvct.launch import Launcher
 from warp_dvct.methods.delta_cone_tracing import light_volumes
 from warp_dvct.passes.gather import Gatherer, gather_all
-from warp_dvct.passes.gbuffer import new_points
 from warp_dvct.passes.shading import shade_direct
 from warp_dvct.plan import Plan, make_plan
 from warp_dvct.scene import Camera, Light, Material, Mesh, Role, Scene
@@ -106,7 +105,9 @@ class Lighting:
         origin, scale = self._device.origin, self._device.scale
         position = ((at.points + at.lift * at.normals - origin) * scale).astype(np.float32)
         white = launcher.full(count, wp.vec3(1.0, 1.0, 1.0), wp.vec3)
-        points = new_points(launcher, count)
+        points = Points()
+        for name, variable in Points.vars.items():
+            setattr(points, name, launcher.zeros(count, variable.type.dtype))
         # Random numbers go by pixel: a picture with one point a pixel.
         pixels = np.stack([np.arange(count) % PICTURE_WIDTH, np.arange(count) // PICTURE_WIDTH], -1)
         points.pixel = launcher.array(pixels.astype(np.int32), wp.vec2i)
