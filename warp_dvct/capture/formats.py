@@ -16,7 +16,7 @@ from warp_dvct.capture.intrinsics import Intrinsics
 from warp_dvct.capture.stage import FrameFiles, rigid_problem
 from warp_dvct.errors import FileError, OptionError
 
-FORMATS = ("redwood", "tum", "7scenes", "scannet", "pair")
+FORMATS = ("redwood", "tum", "7scenes", "scannet", "pair", "points")
 ASSOCIATION = 0.02  # seconds between a depth image and its photograph or pose, at most (the TUM benchmark's tool)
 PRIMESENSE = (525.0, 525.0, 319.5, 239.5)  # OpenNI's default, of 640 x 480; Redwood and TUM say to use it
 KINECT_FUSION = (585.0, 585.0, 320.0, 240.0)  # what 7-Scenes' authors used for depth; its colour is uncalibrated
@@ -56,6 +56,8 @@ def detect_format(folder: Path) -> str:
     """
     if folder.is_file() and folder.suffix == ".sens":
         return "scannet"
+    if folder.is_file() and folder.suffix in (".usd", ".usda", ".usdc", ".usdz"):
+        return "points"
     if not folder.is_dir():
         raise FileError(f"'{folder}' is not a folder; give the one that holds the capture")
     if (folder / "depth.txt").is_file():

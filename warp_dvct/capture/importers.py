@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_dvct.capture import formats
+from warp_dvct.capture.clouds import read_organised
 from warp_dvct.capture.images import image_size, read_color, read_depth
 from warp_dvct.capture.intrinsics import Intrinsics
 from warp_dvct.capture.sens import read_sens
@@ -41,6 +42,7 @@ class ImportOptions:
         color_extrinsic: File of the 4x4 from the depth camera to the colour camera, ``registered`` where both images
             show the same view, ``kinect`` for the factory's 25 mm, or ``none`` to leave colour out.
         up: World axis that points up, one of :data:`UPS`; ``auto`` takes the one that the cameras' tops point to.
+        size: Width and height of organised point clouds.
         fps: Time codes per second.
     """
 
@@ -52,6 +54,7 @@ class ImportOptions:
     depth_unit: float | None = None
     color_extrinsic: str | None = None
     up: str = "auto"
+    size: tuple[int, int] | None = None
     fps: float = 30.0
 
 
@@ -87,7 +90,7 @@ def import_capture(
     """Read a dataset, check every image, and write the capture stage.
 
     Frames whose images are missing or damaged are left out and counted. Images stay where they are, but for ``.sens``
-    containers, which are unpacked into a folder named as ``output``.
+    containers and point clouds, which are unpacked into a folder named as ``output``.
 
     Raises:
         FileError: Nothing is usable, images differ in size, the median depth is implausible, or the output cannot be
@@ -109,7 +112,9 @@ def import_capture(
             f"'{folder}': the median depth is {median:.3g} m with {data.unit:g} m per step, which no depth camera"
             " sees in a room; give --depth-unit (0.001 for mm, 0.0002 for TUM), the same one to insist"
         )
-    up = options.up if options.up != "auto" else _find_up(frames)
+    up = options.up
+    if up == "auto":
+        up = "y" if data.format == "points" else _find_up(frames)  # a stage says what is up
     rig = CaptureRig(data.depth, data.color, data.depth_to_color, data.unit, data.invalid)
     write_capture(output, rig, frames, world=up_matrix(up), fps=options.fps)
     posed = sum(frame.pose is not None for frame in frames)
@@ -121,13 +126,18 @@ def _read(folder: Path, output: Path, options: ImportOptions, progress: Progress
     name = options.format if options.format != "auto" else formats.detect_format(folder)
     if not folder.exists():
         raise FileError(f"'{folder}' does not exist; give the folder that holds the capture")
+    unpacked = output.with_name(f"{output.stem}_frames")
+    if name == "points":
+        if options.size is None:
+            raise OptionError(f"'{folder}': give --size WIDTH HEIGHT of the organised cloud")
+        return read_organised(folder, options.size, unpacked, progress)
     if name != "scannet":
         return READERS[name](folder)
     sens = [folder] if folder.is_file() else sorted(folder.glob("*.sens"))
     if len(sens) > 1:
         raise FileError(f"'{folder}' holds {len(sens)} .sens files; give one of them, as '{sens[0]}'")
     if sens:
-        return read_sens(sens[0], output.with_name(f"{output.stem}_frames"), progress)
+        return read_sens(sens[0], unpacked, progress)
     return formats.read_scannet_folder(folder)
 
 

@@ -53,7 +53,7 @@ def capture() -> None:
 @click.option(
     "--format",
     "format",
-    type=click.Choice(["auto", "redwood", "tum", "7scenes", "scannet", "pair"]),
+    type=click.Choice(["auto", "redwood", "tum", "7scenes", "scannet", "pair", "points"]),
     default="auto",
     show_default=True,
     help="What FOLDER holds.",
@@ -75,9 +75,15 @@ def capture() -> None:
     show_default=True,
     help="World axis that points up; auto: where the cameras' tops point.",
 )
+@click.option(
+    "--size", type=click.IntRange(min=2), nargs=2, metavar="WIDTH HEIGHT", help="Of organised clouds in a USD stage."
+)
 @click.option("--fps", type=click.FloatRange(0.0, min_open=True), default=30.0, show_default=True)
 def import_(folder: str, output: str, **options: Any) -> None:
-    """Make a capture stage of FOLDER, a dataset with depth and colour images; they stay where they are."""
+    """Make a capture stage of FOLDER, a dataset with depth and colour images; they stay where they are.
+
+    FOLDER may also be a USD stage with organised point clouds.
+    """
     from warp_dvct.capture.importers import ImportOptions, import_capture
 
     check_stage_name(output)
