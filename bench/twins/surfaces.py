@@ -5,11 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from warp_dvct.bench.twins.deviation import Deviation, compare
 from warp_dvct.bench.twins.numbers import dot, unit
 from warp_dvct.bench.twins.stage import POINT, Twin, make_scene
+from warp_dvct.kernels import gather
 from warp_dvct.kernels import gbuffer as kernels
+from warp_dvct.passes.gather import shade_indirect
 from warp_dvct.passes.gbuffer import render_gbuffer, see_real
 
 WIDTH, HEIGHT = 40, 30
@@ -84,3 +87,44 @@ def brdf_cos(s: Surfaces, wi: np.ndarray) -> np.ndarray:
     masking = 0.5 / (ci * root_o + co * root_i)
     specular = fresnel(s, dot(s.view, h)) * (d * masking * ci * (s.f90 > 0))[:, None]
     return np.where(front[:, None], diffuse + specular, 0.0)
+
+
+def specular_albedo(f0: np.ndarray, f90: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """What the GGX lobe reflects of even light: the polynomials of ``kernels/materials.py``, fitted to the integral."""
+    a, b = (
+        np.polynomial.polynomial.polyval(alpha, c)
+        for c in (
+            (0.95334536, 0.02103164, -2.02790049, 2.2942133, -0.83604742),
+            (0.04852881, -0.1654349, 0.21658104, -0.09786304),
+        )
+    )
+    return f0 * a[:, None] + (f90 * np.maximum(b, 0.0))[:, None]
+
+
+def measure_indirect_shading(launcher: Any) -> list[Deviation]:
+    """What the picture's points make of irradiance: a Lambert lobe under its interface, and a rough GGX lobe."""
+    twin = Twin.upload(launcher, make_scene(POINT))
+    buffer, s = picture_points(launcher, twin)
+    rng = np.random.default_rng(11)
+    given = [rng.uniform(0, 4, (buffer.count, 3)).astype(np.float32) for _ in range(2)]
+    light, before = (launcher.zeros(buffer.count, wp.vec3) for _ in range(2))
+    shade_indirect(
+        launcher,
+        buffer.points,
+        buffer.count,
+        (launcher.array(given[0], wp.vec3), launcher.array(given[1], wp.vec3)),
+        alpha_max=0.1,
+        light=light,
+        before=before,
+        with_before=True,
+    )
+    passed = 1.0 - s.f0 - (s.f90[:, None] - s.f0) / 21.0
+    leave = 1.0 - fresnel(s, dot(s.normal, s.view))
+    rough = ((s.f90 > 0.0) & (s.alpha > 0.1))[:, None]
+    share = (s.diffuse * passed * leave + np.where(rough, specular_albedo(s.f0, s.f90, s.alpha), 0.0)) / np.pi
+    real = (s.role == 0)[:, None]
+    kernel = gather._shade_indirect
+    return [
+        compare(kernel, "light", light.numpy(), share * np.where(real, given[1].astype(float) - given[0], given[1])),
+        compare(kernel, "before", before.numpy(), np.where(real, share * given[0], 0.0)),
+    ]

@@ -9,9 +9,11 @@ import numpy as np
 import warp as wp
 
 from warp_dvct.bench.twins.deviation import Deviation, compare
-from warp_dvct.bench.twins.stage import POINT, Twin, make_scene
-from warp_dvct.kernels import injection, pyramid, voxelization
+from warp_dvct.bench.twins.stage import MATERIALS, POINT, Twin, make_scene
+from warp_dvct.bench.twins.surfaces import specular_albedo
+from warp_dvct.kernels import bounces, injection, pyramid, voxelization
 from warp_dvct.launch import Launcher
+from warp_dvct.passes.bounces import mean_albedo
 from warp_dvct.passes.injection import empty_flux, inject
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
 from warp_dvct.passes.rsm import ShadowMaps, render_rsm
@@ -86,6 +88,38 @@ def face_areas(twin: Twin) -> np.ndarray:
     real, synthetic = out[..., 0], out[..., 1].copy()
     out[..., 1] = np.minimum(real + synthetic, np.maximum(np.maximum(real, synthetic), 1.0))
     return out
+
+
+def mean_albedos(twin: Twin) -> np.ndarray:
+    """Of the surfaces in each voxel, weighted by area, before and after: ``[x, y, z, 2, 3]``."""
+    each = []
+    for material in MATERIALS:
+        f0 = np.full((1, 3), ((material.ior - 1.0) / (material.ior + 1.0)) ** 2)
+        f90 = np.minimum(50.0 * f0[:, 0], 1.0)
+        passed = 1.0 - f0 - (f90[:, None] - f0) / 21.0
+        alpha = np.array([material.roughness**2])
+        each.append((np.asarray(material.base_color) * passed**2 + specular_albedo(f0, f90, alpha))[0])
+    total, area = np.zeros((N, N, N, 2, 3)), np.zeros((N, N, N, 2, 1))
+    for i, triangle in enumerate(twin.corners * N):
+        low, high = np.floor(triangle.min(0)).astype(int), np.floor(triangle.max(0)).astype(int)
+        for cell in np.ndindex(*(np.minimum(high, N - 1) - low + 1)):
+            at = tuple(low + cell)
+            part = clipped_area(triangle, np.array(at, float))
+            solutions = slice(1, 2) if i >= twin.reals else slice(0, 2)
+            total[at][solutions] += part * each[twin.device.material[i]]
+            area[at][solutions] += part
+    return np.where(area > 1e-6, total / np.where(area > 1e-6, area, 1.0), 0.0)
+
+
+def measure_albedos(launcher: Any) -> list[Deviation]:
+    """Mean albedo behind each record, of voxels that hold more than the rim of a surface."""
+    twin = Twin.upload(launcher, make_scene(POINT))
+    voxels = voxels_of(launcher, twin)
+    got = mean_albedo(launcher, twin.device, voxels, twin.device_normals(launcher)).numpy()
+    grid = dense(voxels, got[: 2 * voxels.level_records[0]].reshape(-1, 2, 3))
+    expected = mean_albedos(twin)
+    solid = (expected[..., 1, 0] > 0.0) & (grid[..., 1, 0] > 0.0)
+    return [compare(bounces._mean_albedo, "albedo", grid[solid].reshape(-1, 6), expected[solid].reshape(-1, 6))]
 
 
 def measure_voxels(launcher: Any) -> list[Deviation]:
