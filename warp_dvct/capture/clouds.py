@@ -55,7 +55,7 @@ def read_organised(
         known = np.isfinite(points).all(-1) & (points[..., 2] != 0.0)
         if known.sum() < LEAST_POINTS:
             raise StageError(f"{where}: {int(known.sum())} points are known; a camera cannot be found from them")
-        backward = np.median(points[..., 2][known]) < 0.0
+        backward = bool(np.median(points[..., 2][known]) < 0.0)
         if backward:
             points = points * [1.0, -1.0, -1.0]
         known &= points[..., 2] > 0.0
@@ -112,12 +112,13 @@ def _fit(points: np.ndarray, known: np.ndarray, size: tuple[int, int], where: st
         StageError: None does to half a pixel.
     """
     v, u = np.indices(known.shape)
-    found, off = [], []
+    found: list[tuple[float, float]] = []
+    off: list[np.ndarray] = []
     for pixel, axis in ((u, 0), (v, 1)):
         slope = points[..., axis][known] / points[..., 2][known]
         table = np.stack([slope, np.ones_like(slope)], -1)
-        solution, *_ = np.linalg.lstsq(table, pixel[known].astype(np.float64), rcond=None)
-        found.append(solution)
+        solution = np.asarray(np.linalg.lstsq(table, pixel[known].astype(np.float64), rcond=None)[0])
+        found.append((float(solution[0]), float(solution[1])))
         off.append(table @ solution - pixel[known])
     error = float(np.sqrt(np.mean(np.square(off))) * np.sqrt(2.0))
     if error > PIXELS_OFF or found[0][0] <= 0.0 or found[1][0] <= 0.0:
@@ -125,7 +126,8 @@ def _fit(points: np.ndarray, known: np.ndarray, size: tuple[int, int], where: st
             f"{where}: the points are not those of a pinhole's pixels, row by row ({error:.1f} pixels off); is --size"
             " right, and are they in the camera's space?"
         )
-    return Intrinsics(*size, found[0][0], found[1][0], found[0][1], found[1][1])
+    (fx, cx), (fy, cy) = found
+    return Intrinsics(*size, fx, fy, cx, cy)
 
 
 def _pose(prim: Usd.Prim, time: float | None, frame: np.ndarray, backward: bool, where: str) -> np.ndarray:

@@ -316,7 +316,7 @@ def _pair(folder: Path) -> tuple[list[Path], list[Path]]:
 def _read_trajectory(file: Path) -> dict[int, np.ndarray]:
     """Redwood's log: a line of three numbers, the first the frame's index, then a 4x4 from camera to world."""
     lines = [line for line in file.read_text().splitlines() if line.strip()]
-    poses = {}
+    poses, k = {}, 0
     try:
         for k in range(0, len(lines), 5):
             index = int(float(lines[k].split()[0]))

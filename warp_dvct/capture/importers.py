@@ -115,7 +115,8 @@ def import_capture(
     up = options.up
     if up == "auto":
         up = "y" if data.format == "points" else _find_up(frames)  # a stage says what is up
-    rig = CaptureRig(data.depth, data.color, data.depth_to_color, data.unit, data.invalid)
+    extrinsic = np.eye(4) if data.depth_to_color is None else data.depth_to_color
+    rig = CaptureRig(data.depth, data.color, extrinsic, data.unit, data.invalid)
     write_capture(output, rig, frames, world=up_matrix(up), fps=options.fps)
     posed = sum(frame.pose is not None for frame in frames)
     colored = sum(frame.color is not None for frame in frames)

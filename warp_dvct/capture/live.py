@@ -198,10 +198,11 @@ class LiveSource:
         known = any(light.kind == LightKind.DOME for light in scene.lights)
         if known or (scene.lights and not self._options.surroundings):
             return scene.lights, np.ones(3), ()
-        if self._mean is None:
-            first = self.capture.color(self.index(None))
-            self._mean = np.full(3, GREY) if first is None else np.maximum(SRGB[first].mean((0, 1)), DARKEST)
         mean = self._mean
+        if mean is None:
+            first = self.capture.color(self.index(None))
+            mean = np.full(3, GREY) if first is None else np.maximum(SRGB[first].mean((0, 1)), DARKEST)
+            self._mean = mean
         gain = np.ones(3) if scene.lights else GREY / mean
         radiance = mean / (1.0 if scene.lights else GREY)
         path = f"{self.capture.depth_path} (surroundings)"

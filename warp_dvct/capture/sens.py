@@ -95,7 +95,7 @@ def _read_header(stream: BinaryIO, file: Path) -> _Header:
         if version != VERSION or length > 4096:
             raise FileError(f"'{file}' is not a .sens file of version {VERSION} (it says {version})")
         _take(stream, length)
-        matrices = [_matrix(stream) for _ in range(4)]
+        color, color_to_rig, depth, depth_to_rig = (_matrix(stream) for _ in range(4))
         color_kind, depth_kind, *sizes = struct.unpack("<ii4I", _take(stream, 24))
         shift, count = struct.unpack("<fQ", _take(stream, 12))
     except EOFError as error:
@@ -107,7 +107,18 @@ def _read_header(stream: BinaryIO, file: Path) -> _Header:
         )
     if not shift > 0.0:
         raise FileError(f"'{file}': its depth shift is {shift}; it must be positive")
-    return _Header(*matrices, color_kind, depth_kind, (sizes[0], sizes[1]), (sizes[2], sizes[3]), shift, count)
+    return _Header(
+        color,
+        color_to_rig,
+        depth,
+        depth_to_rig,
+        color_kind,
+        depth_kind,
+        (sizes[0], sizes[1]),
+        (sizes[2], sizes[3]),
+        shift,
+        count,
+    )
 
 
 def _read_frame(stream: BinaryIO, header: _Header, number: int, target: Path, notes: list[str]) -> FrameFiles:

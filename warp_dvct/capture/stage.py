@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,12 +73,12 @@ class CaptureRig:
 
     depth: Intrinsics
     color: Intrinsics | None = None
-    depth_to_color: np.ndarray = None  # type: ignore[assignment]
+    depth_to_color: np.ndarray = field(default_factory=lambda: np.eye(4))
     unit: float = 0.001
     invalid: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
-        extrinsic = np.eye(4) if self.depth_to_color is None else np.asarray(self.depth_to_color, np.float64)
+        extrinsic = np.asarray(self.depth_to_color, np.float64)
         problem = rigid_problem(extrinsic)
         if problem:
             raise FileError(f"the extrinsic from depth to color {problem}; give a rotation and a translation")
