@@ -85,7 +85,8 @@ def read_stage(
             assert view is not None
             if not (found.lights_defined or allow_no_light):
                 raise StageError(f"{name_of(stage)} has no light; add a UsdLux light")
-            scene = _assemble(ctx, view, plate and os.fspath(plate), found, images or ImageCache())
+            photograph = None if plate is None else os.fspath(plate)
+            scene = _assemble(ctx, view, photograph, found, images or ImageCache())
         except StageError as error:
             # What is missing is often in the file that did not load.
             if not broken:
