@@ -209,3 +209,29 @@ def test_unusable_options_are_refused(wrong):
 def test_a_surface_that_too_few_frames_saw_is_said():
     with pytest.raises(OptionError, match="no surface was seen by at least 3 of 1 frames"):
         fuse(FrameList([plane()]), FusionOptions(weight=3))
+
+
+def test_colour_of_a_camera_beside_the_depth_camera_is_registered(tmp_path, room):
+    from warp_dvct import usd_scenes
+    from warp_dvct.capture.noise import KinectNoise
+    from warp_dvct.capture.simulate import Simulation, simulate
+    from warp_dvct.capture.stage import open_capture
+
+    options = Simulation(
+        frames=3, width=160, height=120, path="orbit", arc=5.0, noise=KinectNoise.only(), unregistered=True
+    )
+    capture = open_capture(simulate(usd_scenes.path("room_area"), tmp_path, options).capture)
+    frame = CaptureFrames(capture).frame(1)
+    assert frame.color is not None
+    hidden = ~np.isfinite(frame.color).all(-1)
+    assert 0.0 < hidden.mean() < 0.3
+    # Red and green walls: colour must change where depth says that the wall begins.
+    assert frame.pose is not None
+    points = (capture.rig.depth.rays() * frame.depth[..., None]) @ frame.pose[:3, :3].T + frame.pose[:3, 3]
+    seen = (frame.depth > 0) & ~hidden
+    left = seen & (points[..., 0] < -1.79)
+    back = seen & (points[..., 2] < -1.79) & (points[..., 0] > -1.7) & (points[..., 0] < 1.7)
+    redness = frame.color[..., 0] / np.maximum(frame.color[..., 1], 1e-3)
+    assert left.sum() > 100
+    assert np.percentile(redness[left], 10) > 3.0
+    assert np.percentile(redness[back], 90) < 3.0

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from warp_dvct.capture.frames import RgbdFrame
+from warp_dvct.capture.registration import register_color, undistorted_depth
 from warp_dvct.capture.stage import Capture, CaptureRig, rigid_problem
 from warp_dvct.errors import FileError
 from warp_dvct.image import srgb_to_linear
@@ -46,18 +48,22 @@ class CaptureFrames:
         problem = None if pose is None else rigid_problem(pose)
         if problem:
             raise FileError(f"{self.name(index)}: its pose {problem}; leave the frame out or repair it")
+        rig = capture.rig
         depth = capture.depth(index)
+        if rig.depth.is_distorted:
+            depth, lens = undistorted_depth(depth, rig.depth)
+            rig = replace(rig, depth=lens)
         codes = capture.color(index) if color else None
-        registered = None if codes is None else self._registered(LINEAR[codes], depth)
-        return RgbdFrame(self.name(index), depth, registered, capture.rig.depth.K, pose)
+        registered = None if codes is None else _registered(LINEAR[codes], depth, rig)
+        return RgbdFrame(self.name(index), depth, registered, rig.depth.K, pose)
 
-    def _registered(self, color: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        rig = self.capture.rig
-        if is_registered(rig):
-            return color
-        from warp_dvct.capture.registration import register_color
 
-        return register_color(color, depth, rig)
+def _registered(color: np.ndarray, depth: np.ndarray, rig: CaptureRig) -> np.ndarray:
+    """The photograph as the depth camera would have taken it; NaN where it does not show what has a depth."""
+    if is_registered(rig):
+        return color
+    found = register_color(depth, color, rig)
+    return np.where(found.visible[..., None], found.color, np.float32(np.nan))
 
 
 def is_registered(rig: CaptureRig) -> bool:
