@@ -111,13 +111,13 @@ def _fit(points: np.ndarray, known: np.ndarray, size: tuple[int, int], where: st
     Raises:
         StageError: None does to half a pixel.
     """
-    v, u = np.indices(known.shape)
+    place = np.indices(known.shape).astype(np.float64)
     found: list[tuple[float, float]] = []
     off: list[np.ndarray] = []
-    for pixel, axis in ((u, 0), (v, 1)):
+    for pixel, axis in ((place[1], 0), (place[0], 1)):
         slope = points[..., axis][known] / points[..., 2][known]
         table = np.stack([slope, np.ones_like(slope)], -1)
-        solution = np.asarray(np.linalg.lstsq(table, pixel[known].astype(np.float64), rcond=None)[0])
+        solution = np.asarray(np.linalg.lstsq(table, pixel[known], rcond=None)[0])
         found.append((float(solution[0]), float(solution[1])))
         off.append(table @ solution - pixel[known])
     error = float(np.sqrt(np.mean(np.square(off))) * np.sqrt(2.0))
