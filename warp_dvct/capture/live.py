@@ -20,7 +20,7 @@ from warp_dvct.capture.stage import Capture, CaptureRig, open_capture
 from warp_dvct.errors import FileError, OptionError, StageError
 from warp_dvct.image import srgb_to_linear
 from warp_dvct.launch import Launcher
-from warp_dvct.passes.depth_filter import DepthFilter, FilteredDepth, FilterOptions
+from warp_dvct.passes.depth_filter import DepthFilter, FilteredDepth, FilterOptions, Guide
 from warp_dvct.scene import Camera, Light, LightKind, Material, Notice, Role, Scene, Texture, Wrap
 
 if TYPE_CHECKING:
@@ -184,10 +184,19 @@ class LiveSource:
                 if str(error) not in self.skipped:
                     self.skipped.append(str(error))
                 continue
-            self._filtered = self._filter.update(depth, pose)
+            # Earlier frames need no photograph: what it moves is not passed on to later ones.
+            self._filtered = self._filter.update(depth, pose, self._guide(number) if number == index else None)
             progress(number + 1 - first, index + 1 - first)
         assert self._filtered is not None
         return self._filtered
+
+    def _guide(self, index: int) -> Guide | None:
+        """The photograph that depth jumps are moved to; None where there is none, or its lens bends."""
+        lens = self.capture.rig.color
+        color = None if lens is None or lens.is_distorted else self.capture.color(index)
+        if lens is None or color is None:
+            return None
+        return Guide(color, (lens.fx, lens.fy, lens.cx, lens.cy), self.capture.rig.depth_to_color)
 
     def _lights(self, scene: Scene) -> tuple[tuple[Light, ...], np.ndarray, tuple[Notice, ...]]:
         """Lights, what to multiply photographs by to have albedo, and what to tell the user.

@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_dvct.errors import OptionError
 from warp_dvct.kernels import depth_filter as kernels
+from warp_dvct.kernels import edge_snapping
 from warp_dvct.launch import Launcher
 
 # Of Kinect v1's inverse depth [1/m]: a sixth of a pixel of disparity at f = 585 px and b = 75 mm (Khoshelham 2012).
@@ -27,6 +28,8 @@ class FilterOptions:
         agree: Difference between two measurements of one point, in ``noise``; plus ``agree_share``.
         fill: Pixels from their edge that holes are filled; 0 for none.
         smooth: A-trous levels; 0 for none.
+        snap: Times that jumps are moved to the photograph's edges, where there is one; 0 for never.
+        contrast: Difference of colours (of codes in [0, 1], all channels together) from which they tell surfaces apart.
         smooth_limit: Bend that is taken for noise at the first level, in ``noise``; half of it at each further one.
     """
 
@@ -39,10 +42,27 @@ class FilterOptions:
     fill: int = 12
     smooth: int = 4
     smooth_limit: float = 4.0
+    snap: int = 2
+    contrast: float = 0.08
 
     def __post_init__(self) -> None:
         if self.noise <= 0.0 or self.frames < 1 or min(self.fill, self.smooth) < 0:
             raise OptionError(f"{self}: noise and frames must be positive, fill and smooth not negative")
+
+
+@dataclass(frozen=True)
+class Guide:
+    """A photograph that tells where surfaces end.
+
+    Attributes:
+        codes: uint8 ``[h, w, 3]``, as stored.
+        lens: ``(fx, fy, cx, cy)`` of its camera, which does not distort.
+        depth_to_color: 4x4, from the depth camera to it.
+    """
+
+    codes: np.ndarray
+    lens: tuple[float, float, float, float]
+    depth_to_color: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -96,9 +116,7 @@ class DepthFilter:
         options: FilterOptions | None = None,
     ) -> None:
         self._launcher, self._options = launcher, options or FilterOptions()
-        self._lens = kernels.Lens()
-        self._lens.fx, self._lens.fy, self._lens.cx, self._lens.cy = lens
-        self._lens.width, self._lens.height = size
+        self._lens = _lens_of(lens, size)
         self._limits = _limits(self._options)
         self._state: tuple[Any, Any, np.ndarray] | None = None
 
@@ -106,12 +124,13 @@ class DepthFilter:
         """Forget the past, as after a cut."""
         self._state = None
 
-    def update(self, depth: np.ndarray, pose: np.ndarray) -> FilteredDepth:
+    def update(self, depth: np.ndarray, pose: np.ndarray, guide: Guide | None = None) -> FilteredDepth:
         """Filter the next frame.
 
         Args:
             depth: Metres along the view axis, float32 ``[h, w]``; 0 where nothing was measured.
             pose: Camera (OpenCV axes) to world, 4x4.
+            guide: The frame's photograph.
         Raises:
             OptionError: The image is not of the lens's size.
         """
@@ -136,6 +155,9 @@ class DepthFilter:
         self._state = inverse, weight, np.array(pose, np.float64)
         with launcher.scope("fill"):
             filled, kind = self._fill(inverse, kind)
+        if guide is not None and self._options.snap > 0:
+            with launcher.scope("snap"):
+                filled = self._snap(filled, guide)
         with launcher.scope("smooth"):
             smooth = self._smooth(filled)
         normal = launcher.empty(count, wp.vec3)
@@ -172,6 +194,23 @@ class DepthFilter:
             inverse, kind = inverse_out, kind_out
         return inverse, kind
 
+    def _snap(self, inverse: Any, guide: Guide) -> Any:
+        launcher, lens = self._launcher, self._lens
+        count = lens.width * lens.height
+        height, width = guide.codes.shape[:2]
+        photo = launcher.array((guide.codes.reshape(-1, 3) / np.float32(255.0)).astype(np.float32), wp.vec3)
+        m = guide.depth_to_color
+        turn, shift = wp.mat33(*m[:3, :3].ravel().tolist()), wp.vec3(*m[:3, 3].tolist())
+        for _ in range(self._options.snap):
+            color, mark = launcher.empty(count, wp.vec3), launcher.empty(count, wp.int32)
+            out = launcher.empty(count, wp.float32)
+            inputs = [lens, inverse, turn, shift, _lens_of(guide.lens, (width, height)), photo]
+            launcher.launch(edge_snapping._sample_guide, count, inputs, [color])
+            launcher.launch(edge_snapping._mark_jumps, count, [lens, self._limits, inverse], [mark])
+            launcher.launch(edge_snapping._snap, count, [lens, inverse, color, mark, self._options.contrast], [out])
+            inverse = out
+        return inverse
+
     def _smooth(self, inverse: Any) -> Any:
         launcher, lens, options = self._launcher, self._lens, self._options
         for level in range(options.smooth):
@@ -180,6 +219,13 @@ class DepthFilter:
             launcher.launch(kernels._smooth, lens.width * lens.height, [lens, limit, 1 << level, inverse], [out])
             inverse = out
         return inverse
+
+
+def _lens_of(numbers: tuple[float, float, float, float], size: tuple[int, int]) -> Any:
+    lens = kernels.Lens()
+    lens.fx, lens.fy, lens.cx, lens.cy = numbers
+    lens.width, lens.height = size
+    return lens
 
 
 def _limits(options: FilterOptions) -> Any:
