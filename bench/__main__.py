@@ -245,6 +245,29 @@ def motion(stage: str, pairs: tuple[str, ...], json_file: Path | None, spp: int,
         write_json(json_file, {"options": asdict(options), "report": asdict(report)})
 
 
+@bench.command()
+@click.option("--stage", default="room_area", show_default=True, help="A bundled stage or a USD file.")
+@click.option("--frames", type=int, default=60, show_default=True, help="Of the simulated capture.")
+@click.option("--width", type=int, default=640, show_default=True, help="Pixels of depth images and photographs.")
+@click.option("--voxel", type=float, default=0.01, show_default=True, help="Metres.")
+@click.option("--tracked", type=int, default=20, show_default=True, help="Frames that are tracked; 0 for none.")
+@click.option("--quality", default="balanced", show_default=True, help="Of the relit pictures.")
+@click.option("--pictures", type=int, default=2, show_default=True, help="How many are compared with the truth's.")
+@click.option("--device", default="cpu", show_default=True, help="cpu or cuda:N.")
+@click.option("--threads", type=int, help="CPU threads; all cores by default.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file too.")
+def reconstruct(stage: str, json_file: Path | None, **rest: Any) -> None:
+    """A simulated capture: time a frame of filter, fusion and tracking, and how near the reconstruction comes."""
+    start_warp(rest["device"])
+    from warp_dvct.bench import reconstruct as module
+
+    options = module.CaptureOptions(**rest)
+    report = module.measure(stage, options)
+    click.echo(module.format_report(report, options))
+    if json_file is not None:
+        write_json(json_file, {"options": asdict(options), "report": asdict(report)})
+
+
 for _command in (*TRADE_COMMANDS, *CHECK_COMMANDS):
     bench.add_command(_command)
 

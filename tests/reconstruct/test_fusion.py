@@ -119,7 +119,7 @@ def test_invalid_depth_is_no_surface():
 
 def test_blocks_are_counted_before_they_are_made(frames):
     counted = count_blocks(frames, COARSE, Skipped(), lambda share: None)
-    grid = fusion._integrate(open3d_for_reconstruction(2), frames, COARSE, counted, Skipped(), lambda share: None)
+    grid = fusion.integrate(open3d_for_reconstruction(2), frames, COARSE, counted, Skipped(), lambda share: None)
     used = grid.hashmap().size()
     assert used <= counted * fusion.SPARE_BLOCKS
     assert counted < 1.5 * used

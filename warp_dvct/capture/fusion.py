@@ -120,7 +120,7 @@ def fuse(
     o3d = open3d_for_reconstruction(threads)
     blocks = count_blocks(source, options, skipped, lambda share: report("sizing", 0.15 * share))
     _check_memory(blocks, options)
-    grid = _integrate(o3d, source, options, blocks, skipped, lambda share: report("fusing", 0.15 + 0.65 * share))
+    grid = integrate(o3d, source, options, blocks, skipped, lambda share: report("fusing", 0.15 + 0.65 * share))
     frames = len(source) - len(skipped.reasons)
     report("meshing", 0.8)
     least = options.weight if options.weight is not None else float(min(3, (frames + 1) // 2))
@@ -189,9 +189,14 @@ def _check_memory(blocks: int, options: FusionOptions) -> None:
         )
 
 
-def _integrate(
-    o3d: Any, source: FrameSource, options: FusionOptions, blocks: int, skipped: Skipped, report: Any
-) -> Any:
+def integrate(o3d: Any, source: FrameSource, options: FusionOptions, blocks: int, skipped: Skipped, report: Any) -> Any:
+    """Bring frames into voxels.
+
+    Args:
+        blocks: How many blocks of voxels to make room for. report: Called with the share of the frames that is done.
+    Returns:
+        ``VoxelBlockGrid``.
+    """
     core = o3d.core
     grid = o3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight", "color"),
