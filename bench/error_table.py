@@ -3,7 +3,7 @@
 Squared FLIP (less that of the truth's noise) of a sweep's point over that of the stage's base point, which has the
 balanced preset's settings at the truth's bounces, gives what a value of a knob costs; the table holds its geometric
 mean over the stages of a class. The base itself is a power law in how much the objects change the picture, found by the
-survey.
+survey. How far several improvements together fall short of their product is fitted to all points.
 """
 
 from __future__ import annotations
@@ -32,11 +32,12 @@ def fit_table(rows: Sequence[Mapping[str, Any]]) -> tuple[Accuracy, list[tuple[s
     """The table, and for each row its name, measured and predicted FLIP.
 
     Args:
-        rows: Of ``bench tradeoff``, delta-cones, of several stages; other methods' are left aside.
+        rows: Of ``bench tradeoff``, delta-cones, of several stages; other methods' and cones, which a budget does not
+            choose, are left aside.
     Raises:
         OptionError: No stage has the base point, or no knob was swept.
     """
-    rows = [r for r in rows if r["method"] == "delta-cones"]
+    rows = [r for r in rows if r["method"] == "delta-cones" and not _by_cones(_settings(r))]
     stages = list(dict.fromkeys(r["stage"] for r in rows))
     launcher = Launcher("cpu")
     surveys = {}
@@ -58,14 +59,21 @@ def fit_table(rows: Sequence[Mapping[str, Any]]) -> tuple[Accuracy, list[tuple[s
                 knobs.setdefault(kind, {})[knob] = table
     if not any(knobs.values()):
         raise OptionError("no knob was swept; run bench tradeoff --knob gather.rays and others first")
-    table = Accuracy(_power_law(base, surveys, points, main), knobs, 0.0)
-    pairs = [
-        (f"{s} {w} {_name(settings)}", flip, table.error(settings, surveys[s], w))
-        for (s, w, settings), flip in points.items()
-        if flip > LEAST
-    ]
-    spread = float(np.std([math.log(m / max(p, 1e-9)) for _, m, p in pairs]))
-    return Accuracy(table.base, table.knobs, spread), pairs
+    coefficients = _power_law(base, surveys, points, main)
+    tables = [Accuracy({**coefficients, "overlap": float(power)}, knobs, 0.0) for power in np.arange(0.1, 1.01, 0.05)]
+
+    def compare(table: Accuracy) -> list[tuple[str, float, float]]:
+        return [
+            (f"{s} {w} {_name(settings)}", flip, table.error(settings, surveys[s], w))
+            for (s, w, settings), flip in points.items()
+            if flip > LEAST
+        ]
+
+    def spread(table: Accuracy) -> float:
+        return float(np.sqrt(np.mean([math.log(m / max(p, 1e-9)) ** 2 for _, m, p in compare(table)])))
+
+    best = min(tables, key=spread)
+    return Accuracy(best.base, best.knobs, spread(best)), compare(best)
 
 
 def net_flip(row: Mapping[str, Any]) -> float:
@@ -75,6 +83,10 @@ def net_flip(row: Mapping[str, Any]) -> float:
 
 def _settings(row: Mapping[str, Any]) -> Settings:
     return make_settings(row["quality"], row["settings"])
+
+
+def _by_cones(settings: Settings) -> bool:
+    return settings.gather == "cones" or settings.shadows == "cone" or settings.glossy == "cones"
 
 
 def _base_points(rows: Sequence[Mapping[str, Any]], points: Mapping[Any, float], main: int) -> dict[str, float]:

@@ -68,7 +68,8 @@ class Accuracy:
     """What was measured of errors.
 
     Attributes:
-        base: Coefficients of the logarithm of FLIP at the balanced preset: see :meth:`balanced`.
+        base: Coefficients of the logarithm of FLIP at the balanced preset, see :meth:`balanced`, and ``overlap``, the
+            power by which improvements of several knobs together fall short of their product.
         knobs: By class of scene and knob: values, and by how much squared FLIP exceeds that of the balanced preset with
             many bounces, over it. Knobs of further bounces go by ``open`` and ``closed`` scenes, the others by
             ``diffuse`` and ``glossy`` ones.
@@ -93,10 +94,10 @@ class Accuracy:
         factor, added = 1.0, 0.0
         for ladder in LADDERS:
             excess = self.excess(ladder.knob, getattr(settings, NAMES[ladder.knob]), survey)
-            # Independent errors add up; what improves takes a share off what the others left.
+            # Independent errors add up; what improves takes a share off what the others left, and these overlap.
             added += max(excess, 0.0)
             factor *= 1.0 + min(excess, 0.0)
-        return self.balanced(survey, width) * math.sqrt(factor * (1.0 + added))
+        return self.balanced(survey, width) * math.sqrt(factor ** self.base["overlap"] * (1.0 + added))
 
     def excess(self, knob: str, value: float, survey: Survey) -> float:
         """Of squared FLIP over the balanced preset's, where only ``knob`` is at ``value``."""
