@@ -7,6 +7,7 @@ from warp_dvct.kernels.depth_filter import Lens, Limits, same_surface
 wp.set_module_options({"enable_backward": False})
 
 REACH = wp.constant(3)  # pixels to each side that tell both surfaces' colours
+BESIDE = wp.constant(3)  # of a pixel's eight neighbours, on the surface that it goes to: none is left alone
 BAND = wp.constant(2)  # pixels from a jump that may be on the wrong side of it
 
 
@@ -95,6 +96,7 @@ def _snap(
         color_near, color_far = wp.vec3(0.0, 0.0, 0.0), wp.vec3(0.0, 0.0, 0.0)
         rho_near, rho_far = float(0.0), float(0.0)
         count_near, count_far = float(0.0), float(0.0)
+        beside_near, beside_far = int(0), int(0)
         for dy in range(-REACH, REACH + 1):
             for dx in range(-REACH, REACH + 1):
                 nx, ny = x + dx, y + dy
@@ -102,6 +104,11 @@ def _snap(
                     j = ny * lens.width + nx
                     other = inverse_in[j]
                     color = guide_in[j]
+                    if other > 0.0 and wp.max(wp.abs(dx), wp.abs(dy)) == 1:
+                        if other > middle:
+                            beside_near += 1
+                        else:
+                            beside_far += 1
                     if other > 0.0 and mark_in[j] == 0 and color[0] >= 0.0:
                         if other > middle:
                             color_near += color
@@ -116,8 +123,8 @@ def _snap(
             color_far /= count_far
             if wp.length(color_near - color_far) > contrast:
                 to_near, to_far = wp.length(guide - color_near), wp.length(guide - color_far)
-                if rho > middle and to_far < 0.7 * to_near:
+                if rho > middle and to_far < 0.7 * to_near and beside_far >= BESIDE:
                     rho = rho_far / count_far
-                elif rho <= middle and to_near < 0.7 * to_far:
+                elif rho <= middle and to_near < 0.7 * to_far and beside_near >= BESIDE:
                     rho = rho_near / count_near
     inverse_out[i] = rho

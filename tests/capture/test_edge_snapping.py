@@ -66,13 +66,16 @@ def snapped(inverse, guide, mark, contrast) -> np.ndarray:
             near, far = sure & (r > middle), sure & (r <= middle)
             if not (near.any() and far.any()):
                 continue
+            ring = inverse[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+            beside_near = (ring > middle).sum() - (rho > middle)
+            beside_far = ((ring > 0) & (ring <= middle)).sum() - (rho <= middle)
             cn, cf = c[near].mean(0), c[far].mean(0)
             if np.linalg.norm(cn - cf) <= contrast:
                 continue
             dn, df = np.linalg.norm(guide[y, x] - cn), np.linalg.norm(guide[y, x] - cf)
-            if rho > middle and df < 0.7 * dn:
+            if rho > middle and df < 0.7 * dn and beside_far >= 3:
                 out[y, x] = r[far].mean()
-            elif rho <= middle and dn < 0.7 * df:
+            elif rho <= middle and dn < 0.7 * df and beside_near >= 3:
                 out[y, x] = r[near].mean()
     return out
 
