@@ -6,6 +6,7 @@ from warp_dvct.kernels.depth_filter import Lens, Limits, same_surface
 
 wp.set_module_options({"enable_backward": False})
 
+TILE = wp.constant(8)  # pixels an edge of the blocks that are left out where no jump is near
 REACH = wp.constant(3)  # pixels to each side that tell both surfaces' colours
 BESIDE = wp.constant(3)  # of a pixel's eight neighbours, on the surface that it goes to: none is left alone
 BAND = wp.constant(2)  # pixels from a jump that may be on the wrong side of it
@@ -58,12 +59,28 @@ def _mark_jumps(
 
 
 @wp.kernel
+def _flag_tiles(
+    first: int, lens: Lens, mark_in: wp.array(dtype=wp.int32), tiles_across: int, flag_out: wp.array(dtype=wp.int32)
+):
+    """1 for blocks of pixels that have a jump in or near them."""
+    t = first + wp.tid()
+    x0, y0 = (t % tiles_across) * TILE, (t / tiles_across) * TILE
+    flag = int(0)
+    for y in range(wp.max(y0 - BAND, 0), wp.min(y0 + TILE + BAND, lens.height)):
+        for x in range(wp.max(x0 - BAND, 0), wp.min(x0 + TILE + BAND, lens.width)):
+            flag = wp.max(flag, mark_in[y * lens.width + x])
+    flag_out[t] = flag
+
+
+@wp.kernel
 def _snap(
     first: int,
     lens: Lens,
     inverse_in: wp.array(dtype=wp.float32),
     guide_in: wp.array(dtype=wp.vec3),
     mark_in: wp.array(dtype=wp.int32),
+    flag_in: wp.array(dtype=wp.int32),
+    tiles_across: int,
     contrast: float,
     inverse_out: wp.array(dtype=wp.float32),
 ):
@@ -77,7 +94,8 @@ def _snap(
     guide = guide_in[i]
     x, y = i % lens.width, i / lens.width
     near_jump = int(0)
-    if rho > 0.0 and guide[0] >= 0.0:
+    flag = flag_in[(y / TILE) * tiles_across + x / TILE]
+    if flag != 0 and rho > 0.0 and guide[0] >= 0.0:
         for dy in range(-BAND, BAND + 1):
             for dx in range(-BAND, BAND + 1):
                 nx, ny = x + dx, y + dy

@@ -87,7 +87,12 @@ def test_kernels_are_their_twins_and_the_edge_becomes_straight(launcher, inverse
     launcher.launch(kernels._mark_jumps, COUNT, [lens, _limits(OPTIONS), rho], [mark])
     np.testing.assert_array_equal(mark.numpy().reshape(inverse.shape), marks(inverse))
     colors = launcher.array(guide.reshape(-1, 3), wp.vec3)
-    launcher.launch(kernels._snap, COUNT, [lens, rho, colors, mark, 0.08], [out])
+    flag = launcher.empty(5 * 4, wp.int32)
+    launcher.launch(kernels._flag_tiles, 5 * 4, [lens, mark, 5], [flag])
+    near = np.pad(marks(inverse), 2)
+    flags = [[near[y : y + 12, x : x + 12].any() for x in range(0, WIDTH, 8)] for y in range(0, HEIGHT, 8)]
+    np.testing.assert_array_equal(flag.numpy().reshape(4, 5), flags)
+    launcher.launch(kernels._snap, COUNT, [lens, rho, colors, mark, flag, 5, 0.08], [out])
     expected = snapped(inverse, guide, marks(inverse), 0.08)
     np.testing.assert_allclose(out.numpy().reshape(inverse.shape), expected, rtol=1e-5)
     known = (inverse > 0) & (guide[..., 0] >= 0)
@@ -95,7 +100,7 @@ def test_kernels_are_their_twins_and_the_edge_becomes_straight(launcher, inverse
     wrong = [(np.abs(r - truth) > 0.1)[known].sum() for r in (inverse, expected)]
     assert wrong[0] > 10
     assert wrong[1] <= 1
-    launcher.launch(kernels._snap, COUNT, [lens, rho, colors, mark, 10.0], [out])
+    launcher.launch(kernels._snap, COUNT, [lens, rho, colors, mark, flag, 5, 10.0], [out])
     np.testing.assert_array_equal(out.numpy(), inverse.ravel())
 
 

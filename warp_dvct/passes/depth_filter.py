@@ -207,7 +207,11 @@ class DepthFilter:
             inputs = [lens, inverse, turn, shift, _lens_of(guide.lens, (width, height)), photo]
             launcher.launch(edge_snapping._sample_guide, count, inputs, [color])
             launcher.launch(edge_snapping._mark_jumps, count, [lens, self._limits, inverse], [mark])
-            launcher.launch(edge_snapping._snap, count, [lens, inverse, color, mark, self._options.contrast], [out])
+            across, down = (-(-n // int(edge_snapping.TILE)) for n in (lens.width, lens.height))
+            flag = launcher.empty(across * down, wp.int32)
+            launcher.launch(edge_snapping._flag_tiles, across * down, [lens, mark, across], [flag])
+            inputs = [lens, inverse, color, mark, flag, across, self._options.contrast]
+            launcher.launch(edge_snapping._snap, count, inputs, [out])
             inverse = out
         return inverse
 
