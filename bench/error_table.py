@@ -1,7 +1,7 @@
 """The table of errors that ``relight --budget`` predicts from, fitted to the rows of ``bench tradeoff``.
 
-Squared FLIP (less that of the truth's noise) of a sweep's point over that of the stage's base point, which has the
-balanced preset's settings at the truth's bounces, gives what a value of a knob costs; the table holds its geometric
+Squared FLIP (less that of the truth's noise) of a sweep's point over that of the stage's base point (``REFERENCE`` of
+:mod:`warp_dvct.budget`) gives what a value of a knob costs; the table holds its geometric
 mean over the stages of a class. The base itself is a power law in how much the objects change the picture, found by the
 survey. How far several improvements together fall short of their product is fitted to all points.
 """
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from warp_dvct.bench.error import read, stage_file
-from warp_dvct.budget import CLOSED, LADDERS, Accuracy, class_of, kind_of
+from warp_dvct.budget import CLOSED, LADDERS, REFERENCE, Accuracy, class_of, kind_of
 from warp_dvct.errors import OptionError
 from warp_dvct.image import write_text
 from warp_dvct.launch import Launcher
@@ -49,7 +49,7 @@ def fit_table(rows: Sequence[Mapping[str, Any]]) -> tuple[Accuracy, list[tuple[s
     points = {(r["stage"], r["width"], _settings(r)): net_flip(r) for r in rows}
     base = _base_points(rows, points, main)
     if not base:
-        raise OptionError("no stage has the balanced preset at the truth's bounces; sweep a knob around it first")
+        raise OptionError("no stage has the reference point; docs/tradeoff.md says how to measure it")
     knobs: dict[str, dict[str, list[list[float]]]] = {}
     for knob in (ladder.knob for ladder in LADDERS):
         classes = {stage: class_of(knob, surveys[stage]) for stage in base}
@@ -82,7 +82,7 @@ def net_flip(row: Mapping[str, Any]) -> float:
 
 
 def _settings(row: Mapping[str, Any]) -> Settings:
-    return make_settings(row["quality"], row["settings"])
+    return Settings(**row["resolved"])
 
 
 def _by_cones(settings: Settings) -> bool:
@@ -90,11 +90,10 @@ def _by_cones(settings: Settings) -> bool:
 
 
 def _base_points(rows: Sequence[Mapping[str, Any]], points: Mapping[Any, float], main: int) -> dict[str, float]:
-    """By stage, FLIP of the balanced preset at the truth's bounces."""
+    """By stage, FLIP at the reference."""
     found = {}
     for row in rows:
-        settings = make_settings("balanced", {"bounces": row["truth"]["bounces"]})
-        flip = points.get((row["stage"], main, settings), 0.0)
+        flip = points.get((row["stage"], main, make_settings("balanced", REFERENCE)), 0.0)
         if flip > LEAST:
             found[row["stage"]] = flip
     return found
@@ -110,10 +109,8 @@ def _excess(
     for (stage, width, settings), flip in points.items():
         if stage not in stages or width != main:
             continue
-        reference = asdict(make_settings("balanced"))
-        changed = {k for k, v in asdict(settings).items() if v != reference[k]} - {"bounces"}
-        alone = changed <= moved if knob != "bounces" else not changed
-        if alone and (knob == "bounces" or settings.bounces == 8):
+        reference = asdict(make_settings("balanced", REFERENCE))
+        if {k for k, v in asdict(settings).items() if v != reference[k]} <= moved:
             value = float(getattr(settings, NAMES[knob]))
             found.setdefault(value, []).append(2.0 * math.log(max(flip, LEAST) / base[stage]))
     values = sorted(found)
@@ -163,9 +160,9 @@ def _power_law(
 
 
 def _name(settings: Settings) -> str:
-    reference = asdict(make_settings("balanced"))
+    reference = asdict(make_settings("balanced", REFERENCE))
     changed = [f"{k}={v}" for k, v in asdict(settings).items() if v != reference[k]]
-    return " ".join(changed) or "balanced"
+    return " ".join(changed) or "reference"
 
 
 def write_table(table: Accuracy, file: Path) -> None:

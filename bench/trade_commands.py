@@ -62,6 +62,7 @@ def backends(stages: tuple[str, ...], pairs: tuple[str, ...], devices, threads, 
     metavar="NAME[=A,B]",
     help="A sweep, with values of your own, 'preset' or 'joint'; repeatable. Default: all, and Mitsuba 3.",
 )
+@click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="A setting of every point, under its own.")
 @click.option("--width", type=int, default=320, show_default=True, help="Pixels across; the height follows the camera.")
 @click.option("--spp", "samples", type=int, default=128, show_default=True, help="Samples per pixel of the truth.")
 @click.option("--bounces", type=int, default=8, show_default=True, help="Of the truth and of all points but presets.")
@@ -74,7 +75,7 @@ def backends(stages: tuple[str, ...], pairs: tuple[str, ...], devices, threads, 
 @click.option("--html", type=FILE, metavar="DIR", help="Also write one self-contained page there.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda:N.")
 @click.option("--threads", type=int, help="CPU threads; all cores by default.")
-def tradeoff(stages: tuple[str, ...], cache: Path | None, html: Path | None, **rest: Any) -> None:
+def tradeoff(stages: tuple[str, ...], pairs: tuple[str, ...], cache: Path | None, html: Path | None, **rest: Any):
     """Every knob of every method: time against error, fronts, and what each knob buys; resumes where it stopped."""
     start_warp(rest["device"])
     from warp_dvct.bench import pareto
@@ -83,7 +84,8 @@ def tradeoff(stages: tuple[str, ...], cache: Path | None, html: Path | None, **r
 
     command = repeat_command()
     measured = {}
-    options = module.TradeoffOptions(cache=cache or cache_folder() / "references", **rest)
+    shared = settings_of(pairs)
+    options = module.TradeoffOptions(settings=shared, cache=cache or cache_folder() / "references", **rest)
     for stage in stages or ("room_area",):
         bench = module.Bench(stage, options, lambda row, known: click.echo(module.format_row(row) + " ·" * known))
         click.echo(f"{stage}, {options.width} x {bench.height}; points marked · were measured before\n{module.HEAD}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ class TradeoffOptions:
     """What is measured; the fields are the command's flags.
 
     Attributes:
+        settings: Of every point, under its own.
         bounces: Of the truth, of the path tracers and of all points but presets.
         samples: Per pixel of the truth. flicker: Frames of the moving shot; 0 for none. repeats: Timed frames a point.
         peers: Whether Mitsuba 3 is measured too, where it is installed.
@@ -44,6 +45,7 @@ class TradeoffOptions:
 
     methods: tuple[str, ...] = ()
     knobs: tuple[str, ...] = ()
+    settings: dict[str, str] = field(default_factory=dict)
     width: int = 320
     samples: int = 128
     bounces: int = MANY_BOUNCES
@@ -139,6 +141,7 @@ class Bench:
         warm: set[str] = set()
         rows = []
         for trial in trials:
+            trial = replace(trial, settings={**options.settings, **trial.settings})
             settings = asdict(make_settings(trial.quality, trial.settings))
             row = self._point(self._key(trial.method, settings), trial, warm)
             # One picture may be a point of several sweeps.
@@ -177,6 +180,8 @@ class Bench:
         }
         settings = {k: str(v) for k, v in trial.settings.items()}
         case = {"method": trial.method, "quality": trial.quality, "settings": settings}
+        # Presets change from commit to commit: what they stood for here is part of the row.
+        case["resolved"] = asdict(make_settings(trial.quality, trial.settings))
         return self._add(key, {**case, "group": trial.group, "value": trial.value, "name": trial.name}, figures, comp)
 
     def _add(self, key: str, case: dict[str, Any], figures: dict[str, Any], comp: np.ndarray) -> dict[str, Any]:

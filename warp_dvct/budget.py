@@ -26,6 +26,24 @@ from warp_dvct.survey import Survey
 TABLE_FILE = Path(__file__).with_name("accuracy.json")
 AIM = 0.95  # of the budget: the model's own spread is then inside of it
 VOXELS_PER_FEATURE = 2.0  # across the smallest extent of an object, for its light not to pass through it
+# The point that the table of errors is relative to, and settings that a budget leaves alone: how many points a stride
+# that is halved here and there adds is not known beforehand.
+REFERENCE = {
+    "volume.resolution": 128,
+    "volume.coarse": 128,
+    "rsm.texels": 1024,
+    "gather.rays": 64,
+    "gather.object_rays": 64,
+    "gather.stride": 6,
+    "gather.object_stride": 3,
+    "gather.detail": 0.0,
+    "shadows.samples": 16,
+    "shadows.probes": 8,
+    "bounces": 8,
+    "patches.count": 8192,
+    "antialias": 4,
+    "glossy.rays": 8,
+}
 MOST_RAYS = 65536
 CLOSED = 0.8  # share of gathered rays that meet a surface: above it a scene counts as a closed room
 OBJECT_STRIDE = {16: 8, 12: 6, 8: 4, 6: 3, 4: 2, 2: 1, 1: 1}
@@ -68,10 +86,10 @@ class Accuracy:
     """What was measured of errors.
 
     Attributes:
-        base: Coefficients of the logarithm of FLIP at the balanced preset, see :meth:`balanced`, and ``overlap``, the
+        base: Coefficients of the logarithm of FLIP at ``REFERENCE``, see :meth:`reference`, and ``overlap``, the
             power by which improvements of several knobs together fall short of their product.
-        knobs: By class of scene and knob: values, and by how much squared FLIP exceeds that of the balanced preset with
-            many bounces, over it. Knobs of further bounces go by ``open`` and ``closed`` scenes, the others by
+        knobs: By class of scene and knob: values, and by how much squared FLIP exceeds that of ``REFERENCE``, over it.
+            Knobs of further bounces go by ``open`` and ``closed`` scenes, the others by
             ``diffuse`` and ``glossy`` ones.
         spread: Standard deviation of the logarithm of measured over predicted FLIP.
     """
@@ -80,8 +98,8 @@ class Accuracy:
     knobs: dict[str, dict[str, list[list[float]]]]
     spread: float
 
-    def balanced(self, survey: Survey, width: int) -> float:
-        """FLIP of the balanced preset: by class, powers of the mean change of the picture and of its width."""
+    def reference(self, survey: Survey, width: int) -> float:
+        """FLIP at ``REFERENCE``: by class, powers of the mean change of the picture and of its width."""
         size = max(survey.affected * survey.change, 1e-3)
         power = self.base["width"] * math.log(width / 320.0)
         power += 0.0 if survey.met > CLOSED else self.base["open"]  # less of the light there is indirect
@@ -97,10 +115,10 @@ class Accuracy:
             # Independent errors add up; what improves takes a share off what the others left, and these overlap.
             added += max(excess, 0.0)
             factor *= 1.0 + min(excess, 0.0)
-        return self.balanced(survey, width) * math.sqrt(factor ** self.base["overlap"] * (1.0 + added))
+        return self.reference(survey, width) * math.sqrt(factor ** self.base["overlap"] * (1.0 + added))
 
     def excess(self, knob: str, value: float, survey: Survey) -> float:
-        """Of squared FLIP over the balanced preset's, where only ``knob`` is at ``value``."""
+        """Of squared FLIP over that at ``REFERENCE``, where only ``knob`` is at ``value``."""
         if not _matters(knob, survey):
             return 0.0
         table = self.knobs.get(class_of(knob, survey), {}).get(knob)
@@ -220,7 +238,7 @@ class _Chooser:
     ) -> None:
         self.survey, self.model, self.accuracy = survey, model, accuracy
         self.width, self.height, self.threads, self.fixed = width, height, threads, fixed
-        self.base = make_settings("balanced", fixed)
+        self.base = make_settings("balanced", {"gather.detail": REFERENCE["gather.detail"], **fixed})
         self.required = math.ceil(VOXELS_PER_FEATURE / survey.feature) if survey.feature > 0.0 else 0
         self.ladders = [
             self._required(x)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 
 import pytest
 from click.testing import CliRunner
@@ -12,6 +13,7 @@ from warp_dvct.bench import budget as module
 from warp_dvct.bench import error_table
 from warp_dvct.bench.__main__ import bench
 from warp_dvct.bench.rows import append_row, read_rows
+from warp_dvct.budget import REFERENCE
 from warp_dvct.errors import OptionError
 from warp_dvct.settings import make_settings
 
@@ -54,9 +56,10 @@ def test_a_tiny_room_keeps_a_budget(tmp_path, monkeypatch):
 
 def sweep_row(stage: str, flip: float, noise: float = 0.0, **settings) -> dict:
     """A point of a sweep with a known error."""
-    pairs = {k.replace("__", "."): str(v) for k, v in settings.items()}
+    pairs = {k.replace("__", "."): v for k, v in settings.items()}
     row = {"kind": "tradeoff", "stage": stage, "method": "delta-cones", "quality": "balanced", "width": 320}
-    row |= {"settings": {"bounces": "8", **pairs}, "truth": {"noise": noise, "bounces": 8}}
+    row |= {"resolved": asdict(make_settings("balanced", {**REFERENCE, **pairs}))}
+    row |= {"truth": {"noise": noise, "bounces": 8}}
     return {**row, "errors": {"FLIP": {"picture": math.hypot(flip, noise)}}}
 
 
@@ -78,11 +81,10 @@ def test_a_table_holds_what_the_rows_say():
 
 
 def test_a_table_needs_a_base_and_a_knob():
-    with pytest.raises(OptionError, match="no stage has the balanced preset"):
+    with pytest.raises(OptionError, match="no stage has the reference point"):
         error_table.fit_table([sweep_row("room_area", 0.02, gather__rays=16, gather__object_rays=16)])
     with pytest.raises(OptionError, match="no knob was swept"):
         error_table.fit_table([sweep_row("room_area", 0.02)])
-    assert make_settings("balanced", {"bounces": "8"}).bounces == 8
 
 
 def test_the_command_writes_a_table(tmp_path):
