@@ -1,9 +1,10 @@
 """Delta voxel cone tracing (Franke 2014): relight a real scene by the light that synthetic objects change.
 
 What it costs: one ray per pixel, RSM rays about as many as occupied voxels, and a sparse gather; independent of the
-triangle count once voxelised. Where it is wrong: light that a glossy surface focuses onto others is spread as if the
-surface were diffuse; detail of the indirect light below a voxel or below the gather's spacing is blurred; glossy
-reflections show the voxels' radiosity; what lies beyond the coarse volume reflects nothing.
+triangle count once voxelised. Where it is wrong: light that a glossy surface focuses onto others is blurred, and from
+the second bounce on spread as if the surface were diffuse; detail of the indirect light below a voxel or below the
+gather's spacing is blurred; glossy reflections show the voxels' radiosity; what lies beyond the coarse volume reflects
+nothing.
 """
 
 from __future__ import annotations
