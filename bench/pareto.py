@@ -103,7 +103,8 @@ def draw(rows: Sequence[Mapping[str, Any]], file: Path) -> list[Path]:
                 axes.annotate(r["value"], place, xytext=(4, 4), textcoords="offset points", fontsize=8, color=color)
     noise = rows[0]["truth"]["noise"]
     axes.axhline(noise, color="#999999", linewidth=0.8, linestyle=":")
-    axes.annotate("the truth's own noise", (axes.get_xlim()[0], noise), fontsize=7, color="#777777", va="bottom")
+    where = axes.get_yaxis_transform()  # along x a share of the width
+    axes.text(0.01, noise, "the truth's own noise", transform=where, fontsize=7, color="#777777", va="bottom")
     axes.set(xscale="log", yscale="log", xlabel="processor time of a frame [s]", ylabel="LDR-FLIP, mean of the picture")
     axes.set_title(
         f"{rows[0]['stage']}, {rows[0]['width']} x {rows[0]['height']}, {rows[0]['truth']['bounces']} bounces"
