@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -43,9 +44,35 @@ def lines() -> list:
     return sorted({command for command in commands if command})
 
 
+@pytest.fixture(scope="session")
+def captured(tmp_path_factory) -> Path:
+    """A folder with a simulated capture, lights for it, and what is made of it."""
+    from warp_dvct import usd_scenes
+    from warp_dvct.capture.noise import KinectNoise
+    from warp_dvct.capture.simulate import Simulation, simulate
+
+    folder = tmp_path_factory.mktemp("captured")
+    options = Simulation(frames=2, path="handheld", noise=KinectNoise.only())
+    simulate(usd_scenes.path("room_area"), folder, options)
+    (folder / "lights.usda").write_text(
+        '#usda 1.0\n(\n    defaultPrim = "Lights"\n    metersPerUnit = 1\n    upAxis = "Y"\n)\n'
+        'def Xform "Lights"\n{\n    def DomeLight "Dome"\n    {\n    }\n}\n'
+    )
+    for command in (
+        "reconstruct capture.usda -o scene.usda --voxel 0.05 --probe lights.usda --albedo color",
+        "capture place scene.usda bunny --pixel 320,420 --height 0.25 -o placed.usda",
+    ):
+        done = shell(f"warp-dvct {command}", folder)
+        assert done.returncode == 0, done.stderr
+    return folder
+
+
 @pytest.fixture
-def workplace(tmp_path, shot) -> Path:
+def workplace(tmp_path, shot, request) -> Path:
     """A folder with the files that the examples name."""
+    command = request.node.callspec.params.get("command", "")
+    if any(name in command for name in ("capture.usda", "scene.usda", "placed.usda")):
+        shutil.copytree(request.getfixturevalue("captured"), tmp_path, dirs_exist_ok=True)
     for name in ("photo.png", "photo.0001.png", "photo.0002.png", "photo.0003.png"):
         write_png(tmp_path / name, np.full((18, 32, 3), 90, np.uint8))
     return tmp_path
@@ -75,11 +102,19 @@ def test_shell_command(command, workplace):
     else:
         assert command.startswith("warp-dvct "), command
         # Smaller than shown, for speed: of an option given twice the last counts.
-        small = "-w 32" if "--budget" in command or "--max-error" in command else SMALL
-        done = shell(f"{command} {small}" if " relight " in command else command, workplace)
+        done = shell(f"{command} {smaller(command)}", workplace)
         assert done.returncode == 0, done.stderr
         for output in re.findall(r" ([\w.#]+\.exr)", command):
             assert list(workplace.glob(output.replace("#", "?"))), f"{output} was not written"
+
+
+def smaller(command: str) -> str:
+    """Options that make a command quick."""
+    if " relight " in command and "placed.usda" in command:
+        return "--quality draft"  # its plate is not resampled
+    if " relight " in command:
+        return "-w 32" if "--budget" in command or "--max-error" in command else SMALL
+    return "--voxel 0.08" if " reconstruct " in command else ""
 
 
 def check_make_target(target: str) -> None:

@@ -247,17 +247,15 @@ def clean_depth(o3d: Any, depth: np.ndarray, options: FusionOptions) -> np.ndarr
 
 
 def _at_jump(inverse: np.ndarray) -> np.ndarray:
-    """Pixels beside one that differs by more than noise and the slope of a surface do; holes are no jumps.
+    """Pixels beside one that differs by more than noise and the slope of a surface do, and beside holes: sensors lose
+    the pixels at a jump, and what they keep beside them is often wrong.
 
     The second difference is that of the noise alone where the surface is plane, however it slopes.
     """
     jump = np.zeros(inverse.shape, bool)
     limit = JUMP * INVERSE_DEPTH_NOISE
-    known = inverse > 0.0
-    across = known[:, :-2] & known[:, 2:] & (np.abs(np.diff(inverse, 2, axis=1)) > limit)
-    down = known[:-2] & known[2:] & (np.abs(np.diff(inverse, 2, axis=0)) > limit)
-    jump[:, 1:-1] |= across
-    jump[1:-1] |= down
+    jump[:, 1:-1] |= np.abs(np.diff(inverse, 2, axis=1)) > limit
+    jump[1:-1] |= np.abs(np.diff(inverse, 2, axis=0)) > limit
     return jump
 
 
