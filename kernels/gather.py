@@ -172,38 +172,6 @@ def ray_incident(world: World, geo: Geometry, origin: wp.vec3, direction: wp.vec
 
 
 @wp.func
-def focused_incident(
-    light: Incident,
-    hits: GlossyHits,
-    geo: Geometry,
-    world: World,
-    real: Hit,
-    synthetic: Hit,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    solid_angle: float,
-    sample: int,
-) -> Incident:
-    """``light``, with what glossy surfaces send along the ray put right."""
-    result = light
-    even = Sent()
-    even.before = light.before
-    even.after = light.after
-    if real.found != 0:
-        if hits.focuses[geo.material[real.triangle]] != 0:
-            sent = focused(hits, geo, world.env, real, origin, direction, solid_angle, even, 1, sample)
-            result.before = sent.before
-            result.after = sent.after
-    if synthetic.found != 0:
-        result.after = light.after
-        if hits.focuses[geo.material[synthetic.triangle]] != 0:
-            even.before = light.after
-            sent = focused(hits, geo, world.env, synthetic, origin, direction, solid_angle, even, 0, sample)
-            result.after = sent.after
-    return result
-
-
-@wp.func
 def escaped(world: World, direction: wp.vec3, aperture: float, solution: int) -> wp.vec3:
     """The environment as a cone reads it, times pi."""
     return environment_radiance(world.env, direction, 2.0 * PI * (1.0 - wp.cos(0.5 * aperture)), solution) * PI
@@ -294,6 +262,63 @@ def kept_real(kept: KeptRays, known: bool, at: int, geo: Geometry, origin: wp.ve
     return hit
 
 
+@wp.struct
+class Ray:
+    """A gathered ray and what it met; ``up`` is 0 where it would start below the surface."""
+
+    up: wp.int32
+    origin: wp.vec3
+    direction: wp.vec3
+    solid_angle: wp.float32
+    real: Hit
+    synthetic: Hit
+
+
+@wp.func
+def gathered_ray(
+    geo: Geometry, s: Surface, rays: int, seed: int, sample: int, kept: KeptRays, known: bool, at: int
+) -> Ray:
+    """Trace one of ``rays`` cosine-distributed rays."""
+    ray = Ray()
+    local = cosine_hemisphere(sobol2(seed, 0, sample, 11))
+    ray.direction = from_frame(local, s.normal)
+    ray.solid_angle = PI / (float(rays) * wp.max(local[2], 0.05))
+    if wp.dot(ray.direction, s.normal_g) > 0.0:
+        ray.up = 1
+        ray.origin = spawn_point(s, ray.direction)
+        ray.real = kept_real(kept, known, at, geo, ray.origin, ray.direction)
+        ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
+    return ray
+
+
+@wp.func
+def focused_incident(light: Incident, hits: GlossyHits, geo: Geometry, world: World, ray: Ray, sample: int) -> Incident:
+    """``light``, with what glossy surfaces send along the ray put right."""
+    result = light
+    even = Sent()
+    even.before = light.before
+    even.after = light.after
+    if ray.real.found != 0:
+        if hits.focuses[geo.material[ray.real.triangle]] != 0:
+            sent = focused(hits, geo, world.env, ray.real, ray.origin, ray.direction, ray.solid_angle, even, 1, sample)
+            result.before = sent.before
+            result.after = sent.after
+    if ray.synthetic.found != 0:
+        result.after = light.after
+        if hits.focuses[geo.material[ray.synthetic.triangle]] != 0:
+            even.before = light.after
+            sent = focused(
+                hits, geo, world.env, ray.synthetic, ray.origin, ray.direction, ray.solid_angle, even, 0, sample
+            )
+            result.after = sent.after
+    return result
+
+
+@wp.func
+def inverse_distance(light: Incident) -> float:
+    return 1.0 / wp.max(wp.min(light.distance_before, light.distance_after), 1.0e-6)
+
+
 @wp.kernel
 def _gather_rays(
     first: int,
@@ -301,7 +326,6 @@ def _gather_rays(
     index_in: wp.array(dtype=wp.int32),
     geo: Geometry,
     world: World,
-    hits: GlossyHits,
     rays: int,
     stride: int,
     seed: int,
@@ -328,21 +352,56 @@ def _gather_rays(
                 known = kept_out.point[i] == j
             start = first_sample(rays, rays, stride, points, j)
             for k in range(rays):
-                local = cosine_hemisphere(sobol2(seed, 0, start + k, 11))
-                direction = from_frame(local, s.normal)
-                solid_angle = PI / (float(rays) * wp.max(local[2], 0.05))
-                if wp.dot(direction, s.normal_g) > 0.0:
-                    origin = spawn_point(s, direction)
-                    real = kept_real(kept_out, known, i * rays + k, geo, origin, direction)
-                    synthetic = trace_synthetic(geo, origin, direction, real.t)
-                    light = hit_incident(world, real, synthetic, origin, direction, solid_angle)
-                    if hits.present != 0:
-                        light = focused_incident(
-                            light, hits, geo, world, real, synthetic, origin, direction, solid_angle, start + k
-                        )
+                ray = gathered_ray(geo, s, rays, seed, start + k, kept_out, known, i * rays + k)
+                if ray.up != 0:
+                    light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
                     before += light.before
                     after += light.after
-                    nearness += 1.0 / wp.max(wp.min(light.distance_before, light.distance_after), 1.0e-6)
+                    nearness += inverse_distance(light)
+            if kept_out.present != 0:
+                kept_out.point[i] = j
+    before_out[i] = before / float(rays)
+    after_out[i] = after / float(rays)
+    nearness_out[i] = nearness / float(rays)
+
+
+@wp.kernel
+def _gather_rays_glossy(
+    first: int,
+    points: Points,
+    index_in: wp.array(dtype=wp.int32),
+    geo: Geometry,
+    world: World,
+    hits: GlossyHits,
+    rays: int,
+    stride: int,
+    seed: int,
+    kept_out: KeptRays,
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+    nearness_out: wp.array(dtype=wp.float32),
+):
+    """As ``_gather_rays``, where what rays meet may be glossy: apart, because it takes three times the registers."""
+    i = first + wp.tid()
+    j = index_in[i]
+    nearness = float(0.0)
+    before = wp.vec3(0.0, 0.0, 0.0)
+    after = wp.vec3(0.0, 0.0, 0.0)
+    if j >= 0:
+        if points.role[j] != BACKGROUND:
+            s = load_surface(points, j)
+            known = False
+            if kept_out.present != 0:
+                known = kept_out.point[i] == j
+            start = first_sample(rays, rays, stride, points, j)
+            for k in range(rays):
+                ray = gathered_ray(geo, s, rays, seed, start + k, kept_out, known, i * rays + k)
+                if ray.up != 0:
+                    light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
+                    light = focused_incident(light, hits, geo, world, ray, start + k)
+                    before += light.before
+                    after += light.after
+                    nearness += inverse_distance(light)
             if kept_out.present != 0:
                 kept_out.point[i] = j
     before_out[i] = before / float(rays)

@@ -172,19 +172,45 @@ def _see_real(
     reach_out[i] = hit.t
 
 
+@wp.func
+def copy_point(source: Points, i: int, target: Points):
+    target.role[i] = source.role[i]
+    target.pixel[i] = source.pixel[i]
+    target.slot[i] = source.slot[i]
+    target.triangle[i] = source.triangle[i]
+    target.position[i] = source.position[i]
+    target.normal_g[i] = source.normal_g[i]
+    target.normal[i] = source.normal[i]
+    target.view[i] = source.view[i]
+    target.base_color[i] = source.base_color[i]
+    target.diffuse[i] = source.diffuse[i]
+    target.f0[i] = source.f0[i]
+    target.lobe[i] = source.lobe[i]
+    target.reach[i] = source.reach[i]
+    target.footprint[i] = source.footprint[i]
+
+
+@wp.kernel
+def _copy_points(first: int, source: Points, points_out: Points):
+    i = first + wp.tid()
+    copy_point(source, i, points_out)
+
+
 @wp.kernel
 def _see_synthetic(
     first: int,
     geo: Geometry,
     mats: Materials,
     cam: CameraFrame,
+    real: Points,
     reach_in: wp.array(dtype=wp.float32),
     width: int,
     height: int,
     points_out: Points,
 ):
-    """Synthetic surfaces in front of what ``points_out`` holds of the real scene."""
+    """Synthetic surfaces in front of what ``real`` holds of the real scene, and that elsewhere."""
     i = first + wp.tid()
+    copy_point(real, i, points_out)
     ray = camera_ray(cam, float(i % width) + 0.5, float(i / width) + 0.5, width, height)
     hit = trace_synthetic(geo, ray.origin, ray.direction, reach_in[i])
     if hit.found != 0:

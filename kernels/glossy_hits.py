@@ -33,7 +33,6 @@ NEGLIGIBLE = wp.constant(0.01)  # share of the diffuse light below which a lobe'
 class GlossyHits:
     """What is needed to shade a glossy hit."""
 
-    present: wp.int32  # 0: no material focuses light
     mats: Materials
     lights: Lights
     bounces: BounceField

@@ -58,39 +58,16 @@ class Gatherer:
             nearness = launcher.empty(max(1, count), wp.float32)
         before = launcher.empty(max(1, count), wp.vec3)
         after = launcher.empty(max(1, count), wp.vec3)
-        if self.cone is None:
-            launcher.launch(
-                kernels._gather_rays,
-                count,
-                [
-                    points,
-                    index,
-                    self.scene.geometry,
-                    self.world,
-                    self.hits or GlossyHits(),
-                    self.rays,
-                    stride,
-                    self.seed,
-                    kept or keep_rays(launcher, 0, 0),
-                ],
-                [before, after, nearness],
-            )
+        shared = [points, index, self.scene.geometry, self.world]
+        if self.cone is not None:
+            how = [self.cones, self.cone, int(self.with_before), self.seed]
+            launcher.launch(kernels._gather_cones, count, [*shared, *how], [before, after])
+            return before, after
+        how = [self.rays, stride, self.seed, kept or keep_rays(launcher, 0, 0)]
+        if self.hits is None:
+            launcher.launch(kernels._gather_rays, count, [*shared, *how], [before, after, nearness])
         else:
-            launcher.launch(
-                kernels._gather_cones,
-                count,
-                [
-                    points,
-                    index,
-                    self.scene.geometry,
-                    self.world,
-                    self.cones,
-                    self.cone,
-                    int(self.with_before),
-                    self.seed,
-                ],
-                [before, after],
-            )
+            launcher.launch(kernels._gather_rays_glossy, count, [*shared, self.hits, *how], [before, after, nearness])
         return before, after
 
 
@@ -114,7 +91,7 @@ def glossy_hits(launcher: Launcher, scene: Scene, device_scene: DeviceScene, bou
     if not focuses.any():
         return None
     hits = GlossyHits()
-    hits.present, hits.seed = 1, seed
+    hits.seed = seed
     hits.mats, hits.lights, hits.bounces = device_scene.materials, device_scene.lights, bounces
     hits.focuses = launcher.array(focuses, wp.int32)
     return hits

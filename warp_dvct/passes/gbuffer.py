@@ -72,12 +72,11 @@ def render_gbuffer(
     """
     pixels = width * height
     shared = [scene.geometry, scene.materials, scene.camera]
-    if real is None:
-        centers, reach = see_real(launcher, scene, width, height)
-    else:
-        centers, reach = copied(launcher, real[0]), real[1]
+    centers, reach = real or see_real(launcher, scene, width, height)
     if scene.synthetic is not None:
-        launcher.launch(kernels._see_synthetic, pixels, [*shared, reach, width, height], [centers])
+        seen = new_points(launcher, pixels)
+        launcher.launch(kernels._see_synthetic, pixels, [*shared, centers, reach, width, height], [seen])
+        centers = seen
     mark = launcher.zeros(pixels, wp.int32)
     if edge_samples > 0:
         launcher.launch(kernels._mark_edges, pixels, [centers, width, height], [mark])
@@ -111,23 +110,12 @@ def new_points(launcher: Launcher, count: int) -> Any:
     return points
 
 
-def copied(launcher: Launcher, points: Any) -> Any:
-    """A copy of ``Points``."""
-    copy = Points()
-    for name, variable in Points.vars.items():
-        source = getattr(points, name)
-        setattr(copy, name, launcher.empty(source.shape[0], variable.type.dtype))
-        wp.copy(getattr(copy, name), source)
-    return copy
-
-
 def extended(launcher: Launcher, points: Any, old: int, count: int) -> Any:
     """The first ``old`` entries of ``points`` in arrays of ``count`` entries."""
     if count == old:
         return points
     larger = new_points(launcher, count)
-    for name in Points.vars:
-        wp.copy(getattr(larger, name), getattr(points, name), count=old)
+    launcher.launch(kernels._copy_points, old, [points], [larger])
     return larger
 
 
