@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,28 @@ def test_real_prims_of_the_stage_are_left_out_and_unseen_surroundings_shine(sour
     assert all(light.kind != LightKind.DOME for light in dark.lights)
     with pytest.raises(OptionError, match="tolerance"):
         LiveOptions(tolerance=0.0)
+
+
+def test_the_rendered_real_scene_is_as_bright_as_the_photograph(source):
+    scene = source.scene(1.0)
+    real = replace(scene, meshes=scene.meshes[:1])
+    layers = Relighter(real, width=160, height=120, quality="draft").render()
+    photo = read_plate(scene.plate)
+    seen = layers.mask_real == 1
+    assert layers.comp[seen].mean() == pytest.approx(photo[seen].mean(), rel=0.15)
+
+
+def test_a_new_light_is_not_taken_for_that_of_the_photograph(tmp_path, capture, launcher):
+    ball = BALL.format(radius=0.1, x=0, y=0.3, z=0)
+    lamp = 'def SphereLight "Lamp"\n{\n    token primvars:dvct:lightRole = "added"\n    float inputs:radius = 0.1\n}\n'
+    scenes = []
+    for name, text in (("none", ball), ("added", ball + lamp)):
+        (tmp_path / f"{name}.usda").write_text(text)
+        scenes.append(LiveSource(tmp_path / f"{name}.usda", capture.capture, launcher=launcher).scene(0.0))
+    domes = [[light for light in scene.lights if light.kind == LightKind.DOME] for scene in scenes]
+    assert [len(d) for d in domes] == [1, 1]
+    assert domes[0][0].radiance == domes[1][0].radiance
+    np.testing.assert_array_equal(scenes[0].textures[-1].pixels, scenes[1].textures[-1].pixels)
 
 
 def test_a_lost_frame_is_said_and_the_next_one_works(tmp_path, capture, launcher):

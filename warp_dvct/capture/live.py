@@ -15,13 +15,14 @@ import numpy as np
 
 from warp_dvct.capture.grid import Grid, GridLimits, depth_grid, grid_mesh
 from warp_dvct.capture.intrinsics import Intrinsics
-from warp_dvct.capture.registration import undistorted_depth
+from warp_dvct.capture.registration import sample, undistorted_depth
 from warp_dvct.capture.stage import Capture, CaptureRig, open_capture
 from warp_dvct.errors import FileError, OptionError, StageError
-from warp_dvct.image import srgb_to_linear
+from warp_dvct.image import read_plate, srgb_to_linear
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.depth_filter import DepthFilter, FilteredDepth, FilterOptions, Guide
-from warp_dvct.scene import Camera, Light, LightKind, Material, Notice, Role, Scene, Texture, Wrap
+from warp_dvct.relighter import Relighter
+from warp_dvct.scene import Camera, Light, LightKind, LightRole, Material, Notice, Role, Scene, Texture, Wrap
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 MOST_ALBEDO = 0.95  # nothing reflects more
 DARKEST = 0.02  # mean of a photograph below which its surroundings are not taken to be
 GREY = 0.5  # albedo where no photograph shows a surface; the mean one of all surfaces, where light is not known
+GAIN_WIDTH = 96  # pixels of the picture that tells how bright the known lights make the real scene
+MOST_GAIN = 4.0  # that photographs are made brighter or darker to have albedo
+CLIPPED = 0.98  # of a photograph's white: what is brighter may have been anything
 SRGB = srgb_to_linear(np.arange(256) / 255.0)
 
 Progress = Callable[[int, int], None]
@@ -87,6 +91,7 @@ class LiveSource:
         self._next = 0
         self._filtered: FilteredDepth | None = None
         self._mean: np.ndarray | None = None
+        self._gain: float | None = None
         self.skipped: list[str] = []
 
     @property
@@ -117,20 +122,24 @@ class LiveSource:
             StageError: There is no such frame, or its pose is not known.
             FileError: Its images cannot be read; earlier frames that cannot are left out and listed in ``skipped``.
         """
-        from warp_dvct.usd.read import read_stage
-
         index = self.index(time)
         pose = self.capture.pose(index)
         if pose is None:
             raise StageError(
                 f"{self.capture.name(index)} has no known pose; find the poses with `warp-dvct reconstruct --track`"
             )
-        filtered = self._advance(index, progress)
+        return self._assemble(index, pose, self._advance(index, progress))
+
+    def _assemble(self, index: int, pose: np.ndarray, filtered: FilteredDepth, *, fit: bool = True) -> Scene:
+        """The scene of a frame with that depth; without ``fit`` photographs are albedo as they are, where light is
+        known."""
+        from warp_dvct.usd.read import read_stage
+
         color = self.capture.color(index)
         camera = _view(self.capture, index, pose, has_color=color is not None)
         scene = read_stage(
             self._stage,
-            time=time,
+            time=self.capture.times[index],
             view=camera,
             plate=self.capture.color_file(index),
             allow_empty_roles=True,
@@ -141,6 +150,8 @@ class LiveSource:
         clouds = tuple(cloud for cloud in scene.point_clouds if cloud.role == Role.SYNTHETIC)
         grid = self._grid(filtered)
         lights, gain, notices = self._lights(scene)
+        if fit and color is not None and _plate_lights(scene.lights):
+            gain = gain * self._fitted_gain()
         surface = Material(
             base_color=(GREY, GREY, GREY), roughness=1.0, ior=1.0, name=f"{self.capture.depth_path} (live)"
         )
@@ -201,23 +212,53 @@ class LiveSource:
     def _lights(self, scene: Scene) -> tuple[tuple[Light, ...], np.ndarray, tuple[Notice, ...]]:
         """Lights, what to multiply photographs by to have albedo, and what to tell the user.
 
-        Where the stage has no light at all, the dome is so bright that the mean albedo is :data:`GREY`. Else light is
-        taken to make surfaces as bright as their albedo, which is the paper's choice (Knecht et al. 2012).
+        Where the stage has no light of the photograph, the dome is so bright that the mean albedo is :data:`GREY`.
+        Else photographs are albedo up to one factor.
         """
-        known = any(light.kind == LightKind.DOME for light in scene.lights)
-        if known or (scene.lights and not self._options.surroundings):
+        plate_lights = _plate_lights(scene.lights)
+        known = any(light.kind == LightKind.DOME for light in plate_lights)
+        if known or (plate_lights and not self._options.surroundings):
             return scene.lights, np.ones(3), ()
         mean = self._mean
         if mean is None:
-            first = self.capture.color(self.index(None))
+            first = self.capture.color(self._first_usable())
             mean = np.full(3, GREY) if first is None else np.maximum(SRGB[first].mean((0, 1)), DARKEST)
             self._mean = mean
-        gain = np.ones(3) if scene.lights else GREY / mean
-        radiance = mean / (1.0 if scene.lights else GREY)
+        gain = np.ones(3) if plate_lights else GREY / mean
+        radiance = mean / (1.0 if plate_lights else GREY)
         path = f"{self.capture.depth_path} (surroundings)"
         dome = Light(LightKind.DOME, (float(radiance[0]), float(radiance[1]), float(radiance[2])), path=path)
         said = "the stage has no dome light: what no depth image shows is taken as bright as the photographs' mean"
         return (*scene.lights, dome), gain, (Notice(self.capture.path, said),)
+
+    def _first_usable(self) -> int:
+        """The first frame with a known pose whose images can be read: light is judged by it for the whole capture.
+
+        Raises:
+            FileError: There is none.
+        """
+        said = f"'{self.capture.path}' has no frame with a known pose"
+        for index in self.capture:
+            if self.capture.pose(index) is not None:
+                try:
+                    self.capture.depth(index)
+                    self.capture.color(index)
+                    return index
+                except FileError as error:
+                    said = str(error)
+        raise FileError(said)
+
+    def _fitted_gain(self) -> float:
+        """The factor from photographs to albedo: with it the first frame, rendered, is as bright as its photograph."""
+        if self._gain is None:
+            index = self._first_usable()
+            pose = self.capture.pose(index)
+            assert pose is not None
+            depth, lens = undistorted_depth(self.capture.depth(index), self.capture.rig.depth)
+            alone = DepthFilter(self._launcher, (lens.fx, lens.fy, lens.cx, lens.cy), lens.size, self._options.filter)
+            scene = self._assemble(index, pose, alone.update(depth, pose), fit=False)
+            self._gain = _brightness_ratio(scene, self._launcher)
+        return self._gain
 
     def _grid(self, filtered: FilteredDepth) -> Grid:
         options = self._options.filter
@@ -232,6 +273,30 @@ def _view(capture: Capture, index: int, pose: np.ndarray, *, has_color: bool) ->
     lens: Intrinsics = rig.color if has_color and rig.color is not None else rig.depth
     path = capture.color_path if has_color and capture.color_path else capture.depth_path
     return lens.scene_camera(pose @ np.linalg.inv(rig.depth_to_color) if has_color else pose, path)
+
+
+def _plate_lights(lights: tuple[Light, ...]) -> tuple[Light, ...]:
+    """Those that light the photograph."""
+    return tuple(light for light in lights if light.role == LightRole.PLATE)
+
+
+def _brightness_ratio(scene: Scene, launcher: Launcher) -> float:
+    """How many times brighter the photograph is than the rendered real scene, on surfaces that are not clipped."""
+    real = replace(scene, meshes=scene.meshes[:1], point_clouds=(), lights=_plate_lights(scene.lights))
+    relighter = Relighter(
+        real, width=GAIN_WIDTH, quality="draft", device=launcher.device.alias, threads=launcher.threads
+    )
+    layers = relighter.render()
+    assert scene.plate is not None
+    photo = read_plate(scene.plate)
+    v, u = np.indices(layers.depth.shape) + 0.5
+    scale = np.array([photo.shape[1] / layers.depth.shape[1], photo.shape[0] / layers.depth.shape[0]])
+    seen, _ = sample(photo, np.stack([u, v], -1) * scale - 0.5)
+    compared = (layers.mask_real == 1.0) & (seen.max(-1) < CLIPPED)
+    rendered = float(layers.comp[compared].sum())
+    if rendered <= 0.0:
+        return 1.0
+    return float(np.clip(seen[compared].sum() / rendered, 1.0 / MOST_GAIN, MOST_GAIN))
 
 
 def _albedo_texture(color: np.ndarray, gain: np.ndarray, name: str) -> Texture:
