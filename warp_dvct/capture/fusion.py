@@ -208,12 +208,13 @@ def integrate(o3d: Any, source: FrameSource, options: FusionOptions, blocks: int
     )
     band = (1.0, options.far, options.truncation)  # metres per step, most depth, truncation
     for index, frame in usable_frames(source, skipped):
+        assert frame.pose is not None
         depth = clean_depth(o3d, frame.depth, options)
         # Open3D cuts pixel coordinates off instead of rounding: its pixel centres lie at half numbers.
         K, extrinsic = core.Tensor(frame.K + HALF_PIXEL), core.Tensor(np.linalg.inv(frame.pose))
         color = np.zeros((*depth.shape[:2], 3), np.float32) if frame.color is None else frame.color
         # A pixel without colour would pull the mean to black: its depth waits for a frame that sees it in colour.
-        unseen = ~np.isfinite(color).all(-1)
+        unseen = np.asarray(~np.isfinite(color).all(-1))
         if unseen.any():
             depth[unseen], color = 0.0, np.where(unseen[..., None], np.float32(0.0), color)
         if not depth.any():

@@ -151,7 +151,7 @@ def fit_light(launcher: Launcher, mesh: FusedMesh, *, voxel: float, seed: int = 
             f"only {model.open:.1%} of the directions above the surface are open: no light from outside reaches it, so"
             " none can be estimated; give the lamps inside by --probe LIGHTS.usda"
         )
-    solver = Solver(seen, model.dome, model.light, clipped=(seen >= CLIPPED).any(-1), seed=seed)
+    solver = Solver(seen, model.dome, model.light, clipped=np.any(seen >= CLIPPED, axis=-1), seed=seed)
     tried = fibonacci_sphere(TRIED)
     tried = tried[tried[:, 1] > LOWEST]
     columns = model.try_directions(tried)
@@ -257,7 +257,7 @@ class ShadingModel:
         sun = Light(LightKind.DISTANT, (1.0, 1.0, 1.0))
         self._lights = upload_lights(launcher, (sun,) * self.count, np.zeros(3), 1.0)
         self._last: tuple[np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
-        harmonics = self._harmonics(differentiate=True)
+        harmonics: Any = self._harmonics(differentiate=True)
         _, _, seen = self._differentiate(harmonics, np.array([0.0, 1.0, 0.0]), RAYS, 0)
         # Each of the three equal channels was seeded with 1.
         self.dome = harmonics.grad.numpy().reshape(self.count, 9, 3).mean(-1).astype(np.float64)
@@ -292,14 +292,15 @@ class ShadingModel:
         """The light's irradiance and its derivative, and the open share; the dome's derivative is in ``harmonics``."""
         launcher, count, device = self._launcher, self.count, self._launcher.device
         lights = self._lights
-        lights.direction = wp.full(count, wp.vec3(*(-toward).tolist()), wp.vec3, device=device, requires_grad=True)
+        direction: Any = wp.full(count, wp.vec3(*(-toward).tolist()), wp.vec3, device=device, requires_grad=True)
+        lights.direction = direction
         kinds = (wp.vec3, wp.vec3, wp.float32)
         outputs = [wp.zeros(count, dtype=kind, device=device, requires_grad=True) for kind in kinds]
         inputs = [self._device.geometry, lights, self._position, self._normal, harmonics, rays, samples, self._seed]
         seeds = {output: wp.full(count, wp.vec3(1.0, 1.0, 1.0), wp.vec3, device=device) for output in outputs[:2]}
         launcher.differentiate(kernels._light_points, count, inputs, outputs, seeds)
         value = outputs[1].numpy().mean(-1).astype(np.float64)
-        gradient = -lights.direction.grad.numpy().astype(np.float64) / 3.0  # three equal channels were seeded
+        gradient = -direction.grad.numpy().astype(np.float64) / 3.0  # three equal channels were seeded
         return value, gradient, outputs[2].numpy()
 
 

@@ -172,7 +172,8 @@ def spot_on_marker(
     if surface is None:
         index = found[int(np.argmin(distance))][0]
         pose = known_pose(capture, index)
-        surface = depth_points(capture.rig.depth, capture.depth(index)) @ pose[:3, :3].T + pose[:3, 3]
+        local = depth_points(capture.rig.depth, capture.depth(index))
+        return snapped(spot, local @ pose[:3, :3].T + pose[:3, 3], size)
     return snapped(spot, surface, size)
 
 

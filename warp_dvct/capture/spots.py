@@ -163,7 +163,7 @@ def fit_plane(points: np.ndarray, seed: np.ndarray, reach: float, where: str) ->
         first *= 1.5
     normal, center = _plane(points[distance < first], where)
     wide = points[(distance < max(reach, first)) & (np.abs((points - center) @ normal) < OFF_PLANE)]
-    weight = np.ones(len(wide))
+    weight, off = np.ones(len(wide)), np.zeros(len(wide))
     for _ in range(ROUNDS):
         normal, center = _plane(wide, where, weight)
         off = (wide - center) @ normal
