@@ -67,7 +67,11 @@ def test_every_folder_with_code_is_in_the_installed_package():
         "warp_dvct." + ".".join(file.parent.relative_to(ROOT / "warp_dvct").parts)
         for file in (ROOT / "warp_dvct").rglob("*/__init__.py")
     }
-    mapped = {f"warp_dvct.{folder}" for folder in ("kernels", "usd_scenes", "bench")}
+    mapped = {
+        "warp_dvct." + ".".join(file.parent.relative_to(ROOT).parts)
+        for folder in ("kernels", "usd_scenes", "bench")
+        for file in (ROOT / folder).rglob("__init__.py")
+    }
     assert declared == folders | mapped
     for name in declared:
         importlib.import_module(name)

@@ -37,9 +37,10 @@ def test_a_command_is_understood(line):
     else:
         assert words[0] == "warp-dvct", line
         words = words[1:]
-    command = group.get_command(click.Context(group), words[0])
+    parent = click.Context(group, **group.context_settings)  # commands keep the help options of the first they see
+    command = group.get_command(parent, words[0])
     assert command is not None, line
-    command.make_context(words[0], words[1:])
+    command.make_context(words[0], words[1:], parent=parent)
 
 
 def test_links_and_pictures_are_there():

@@ -82,7 +82,7 @@ def test_glossy_pixels_are_left_out_of_the_indirect_light(cache, launcher):
 
 
 def test_more_of_everything_lowers_the_error(cache):
-    """First and third step of the curve; indirect energy within 2 % at the third."""
+    """First and third step of the curve. So small a picture's indirect energy scatters by 1 % with the seed."""
     chosen = {name: module.CURVE[name] for name in ("1/4", "1")}
     seen = []
     _, (low, middle) = module.measure(
@@ -92,8 +92,8 @@ def test_more_of_everything_lowers_the_error(cache):
     assert middle.flip < 0.8 * low.flip
     assert middle.flip_affected < 0.8 * low.flip_affected
     assert middle.delta_error < 0.6 * low.delta_error
-    assert abs(middle.energy_before - 1) < 0.02
-    assert abs(middle.energy_after - 1) < 0.02
+    assert abs(middle.energy_before - 1) < 0.03
+    assert abs(middle.energy_after - 1) < 0.03
     assert low.cpu_seconds > 0
 
 
@@ -108,18 +108,19 @@ def test_curve_turns_every_knob_up():
 def test_compare_prints_a_line_per_setting_and_writes_json(cache, tmp_path):
     file = tmp_path / "figures.json"
     arguments = ["compare", "--stage", "room_area", "--width", str(WIDTH), "--spp", str(SPP), "--cache", str(cache)]
-    arguments += ["--quality", "draft", "--try", "", "--try", "by cones: gather=cones", "--json", str(file)]
+    arguments += ["--quality", "draft", "--json", str(file)]
+    arguments += ["--try", "", "--try", "one ray: gather.rays=1 gather.object_rays=1"]
     result = CliRunner().invoke(bench, arguments, catch_exceptions=False)
     assert result.exit_code == 0
-    head, columns, preset, cones, noise, *_ = result.output.splitlines()
+    head, columns, preset, one_ray, noise, *_ = result.output.splitlines()
     assert head.startswith("room_area, 64 pixels wide, delta-cones draft")
     assert " ".join(columns.split()) == "setting seconds CPU s FLIP affected delta err E before E after"
-    assert len(columns) == len(preset) == len(cones)
+    assert len(columns) == len(preset) == len(one_ray)
     assert preset.split()[0] == "preset"
-    assert cones.startswith("by cones")
+    assert one_ray.startswith("one ray")
     assert "noise is FLIP" in noise
     trials = json.loads(file.read_text())["trials"]
-    assert [t["name"] for t in trials] == ["preset", "by cones"]
+    assert [t["name"] for t in trials] == ["preset", "one ray"]
     assert trials[1]["delta_error"] > trials[0]["delta_error"]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -73,6 +74,8 @@ def workplace(tmp_path, shot, request) -> Path:
     command = request.node.callspec.params.get("command", "")
     if any(name in command for name in ("capture.usda", "scene.usda", "placed.usda")):
         shutil.copytree(request.getfixturevalue("captured"), tmp_path, dirs_exist_ok=True)
+    if " import scan " in command:
+        runpy.run_path(str(ROOT / "tests" / "capture" / "datasets.py"))["redwood"](tmp_path / "scan")
     for name in ("photo.png", "photo.0001.png", "photo.0002.png", "photo.0003.png"):
         write_png(tmp_path / name, np.full((18, 32, 3), 90, np.uint8))
     return tmp_path

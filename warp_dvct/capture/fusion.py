@@ -262,7 +262,7 @@ def _at_jump(inverse: np.ndarray) -> np.ndarray:
 
 def _finished(o3d: Any, mesh: Any, options: FusionOptions, skipped: Skipped, frames: int) -> FusedMesh:
     """Drop floaters, close holes, decimate."""
-    legacy = mesh.to_legacy()
+    legacy = _in_order(o3d, mesh.to_legacy())
     of_triangle, _, areas = legacy.cluster_connected_triangles()
     areas = np.asarray(areas)
     least = options.least_area if options.least_area is not None else (LEAST_EDGE * options.voxel) ** 2
@@ -287,6 +287,25 @@ def _finished(o3d: Any, mesh: Any, options: FusionOptions, skipped: Skipped, fra
         components=len(areas),
         dropped=int(floats.sum()),
     )
+
+
+def _in_order(o3d: Any, legacy: Any) -> Any:
+    """The mesh with vertices sorted by place and triangles by vertices: Open3D's threads leave them in any order."""
+    points, triangles = np.asarray(legacy.vertices), np.asarray(legacy.triangles)
+    order = np.lexsort(points.T[::-1])
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    corners = rank[triangles]
+    first = corners.argmin(1)
+    corners = np.take_along_axis(corners, (first[:, None] + np.arange(3)) % 3, 1)
+    corners = corners[np.lexsort(corners.T[::-1])]
+    sorted_mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(points[order]), o3d.utility.Vector3iVector(corners.astype(np.int32))
+    )
+    sorted_mesh.vertex_normals = o3d.utility.Vector3dVector(np.asarray(legacy.vertex_normals)[order])
+    if legacy.has_vertex_colors():
+        sorted_mesh.vertex_colors = o3d.utility.Vector3dVector(np.asarray(legacy.vertex_colors)[order])
+    return sorted_mesh
 
 
 def _closed(o3d: Any, legacy: Any, radius: float) -> Any:
