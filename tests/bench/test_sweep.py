@@ -82,18 +82,18 @@ def test_glossy_pixels_are_left_out_of_the_indirect_light(cache, launcher):
 
 
 def test_more_of_everything_lowers_the_error(cache):
-    """First and third step of the curve. So small a picture's indirect energy scatters by 1 % with the seed."""
+    """First and third step of the curve; indirect energy within 2 % at the third, over four seeds."""
     chosen = {name: module.CURVE[name] for name in ("1/4", "1")}
+    again = {f"1, seed {n}": {**module.CURVE["1"], "seed": str(n)} for n in (1, 2, 3)}
     seen = []
-    _, (low, middle) = module.measure(
-        "room_area", chosen, SweepOptions(width=128, samples=SPP, cache=cache), seen.append
-    )
-    assert [t.name for t in seen] == ["1/4", "1"]
+    options = SweepOptions(width=128, samples=SPP, cache=cache)
+    _, (low, middle, *others) = module.measure("room_area", {**chosen, **again}, options, seen.append)
+    assert [t.name for t in seen] == ["1/4", "1", *again]
     assert middle.flip < 0.8 * low.flip
     assert middle.flip_affected < 0.8 * low.flip_affected
     assert middle.delta_error < 0.6 * low.delta_error
-    assert abs(middle.energy_before - 1) < 0.03
-    assert abs(middle.energy_after - 1) < 0.03
+    assert abs(np.mean([t.energy_before for t in (middle, *others)]) - 1) < 0.02
+    assert abs(np.mean([t.energy_after for t in (middle, *others)]) - 1) < 0.02
     assert low.cpu_seconds > 0
 
 
