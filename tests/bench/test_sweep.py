@@ -108,19 +108,19 @@ def test_curve_turns_every_knob_up():
 def test_compare_prints_a_line_per_setting_and_writes_json(cache, tmp_path):
     file = tmp_path / "figures.json"
     arguments = ["compare", "--stage", "room_area", "--width", str(WIDTH), "--spp", str(SPP), "--cache", str(cache)]
-    arguments += ["--quality", "draft", "--json", str(file)]
-    arguments += ["--try", "", "--try", "one ray: gather.rays=1 gather.object_rays=1"]
+    arguments += ["--quality", "balanced", "--json", str(file)]
+    arguments += ["--try", "", "--try", "by cones: gather=cones"]
     result = CliRunner().invoke(bench, arguments, catch_exceptions=False)
     assert result.exit_code == 0
-    head, columns, preset, one_ray, noise, *_ = result.output.splitlines()
-    assert head.startswith("room_area, 64 pixels wide, delta-cones draft")
+    head, columns, preset, cones, noise, *_ = result.output.splitlines()
+    assert head.startswith("room_area, 64 pixels wide, delta-cones balanced")
     assert " ".join(columns.split()) == "setting seconds CPU s FLIP affected delta err E before E after"
-    assert len(columns) == len(preset) == len(one_ray)
+    assert len(columns) == len(preset) == len(cones)
     assert preset.split()[0] == "preset"
-    assert one_ray.startswith("one ray")
+    assert cones.startswith("by cones")
     assert "noise is FLIP" in noise
     trials = json.loads(file.read_text())["trials"]
-    assert [t["name"] for t in trials] == ["preset", "one ray"]
+    assert [t["name"] for t in trials] == ["preset", "by cones"]
     assert trials[1]["delta_error"] > trials[0]["delta_error"]
 
 
