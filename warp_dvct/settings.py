@@ -61,6 +61,12 @@ class Settings:
     gather_detail: float = _knob(
         0.25, "bound on the change within a stride beyond which it is halved; 0 for never", low=0.0, high=100.0
     )
+    gather_change: float = _knob(
+        0.01,
+        "on a plate: least change of irradiance, as a share of it, for halving the stride; 0 for any",
+        low=0.0,
+        high=1.0,
+    )
     gather_smoothing: int = _knob(1, "a-trous steps that smooth what rays gathered; 0 for none", low=0, high=6)
     gather_radius: int = _knob(1, "gather points to each side that reconstruction looks at", low=0, high=16)
 

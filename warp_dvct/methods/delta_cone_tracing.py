@@ -392,6 +392,7 @@ def _irradiance(
         radius=settings.gather_radius,
         smoothing=settings.gather_smoothing,
         detail=settings.gather_detail,
+        change=0.0 if part.with_before else settings.gather_change,
         kept=rays,
     )
     if scene.synthetic is not None:

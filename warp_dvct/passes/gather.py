@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
+from warp_dvct.kernels import changed_detail, reconstruction
 from warp_dvct.kernels import gather as kernels
-from warp_dvct.kernels import reconstruction
 from warp_dvct.kernels.glossy_hits import FOCUSING, GlossyHits
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.gbuffer import GBuffer, compact
@@ -141,6 +141,7 @@ def gather_sparse(
     radius: int,
     smoothing: int = 0,
     detail: float = 0.0,
+    change: float = 0.0,
     kept: Any = None,
 ) -> tuple[Any, Any]:
     """Irradiance, before and after, at every shading point of a role.
@@ -152,6 +153,8 @@ def gather_sparse(
     Args:
         detail: Bound on the relative change of irradiance within a block (Ward et al. 1988) beyond which it is gathered
             at half the stride; 0 for never.
+        change: Least change around a block, as a share of irradiance, for that; 0 for any. For pictures of which only
+            the change is used.
         kept: ``KeptRays`` with a slot per block, for the role REAL.
 
     Returns:
@@ -165,7 +168,7 @@ def gather_sparse(
     steps = smoothing if gatherer.cone is None else 0
     grid = _smooth(launcher, buffer, grid, launcher.full(grid.count, 1, wp.int32), steps)
     while detail > 0.0 and grid.stride > FINEST and grid.stride % 2 == 0 and gatherer.cone is None:
-        grid = _refine(launcher, buffer, role, gatherer, grid, radius, steps, detail)
+        grid = _refine(launcher, buffer, role, gatherer, grid, radius, steps, detail, change)
     before = launcher.zeros(buffer.count, wp.vec3)
     after = launcher.zeros(buffer.count, wp.vec3)
     missing = launcher.empty(buffer.count, wp.int32)
@@ -216,6 +219,7 @@ def _refine(
     radius: int,
     smoothing: int,
     detail: float,
+    change: float,
 ) -> _Grid:
     """A grid of half the stride: gathered where ``grid`` cannot tell, interpolated elsewhere."""
     points, stride = buffer.points, grid.stride // 2
@@ -232,6 +236,9 @@ def _refine(
         [points, buffer.width, columns, choice, grid.guide(radius), *coarse, detail],
         [mark, nearness, before, after],
     )
+    if change > 0.0:
+        inputs = [grid.columns, grid.rows, columns, grid.before, grid.after, before, change]
+        launcher.launch(changed_detail._unmark_unchanged, count, inputs, [mark])
     _, listed, found = compact(launcher, mark)
     index = launcher.empty(max(1, found), wp.int32)
     launcher.launch(reconstruction._pick, found, [listed, choice], [index])
