@@ -219,7 +219,7 @@ def _see_synthetic(
 
 
 @wp.func
-def differs(points: Points, i: int, j: int) -> bool:
+def differs(points: Points, i: int, j: int, paint: int) -> bool:
     role = points.role[i]
     if role != points.role[j]:
         return True
@@ -232,13 +232,17 @@ def differs(points: Points, i: int, j: int) -> bool:
     gap = wp.max(wp.abs(wp.dot(offset, points.normal_g[i])), wp.abs(wp.dot(offset, points.normal_g[j])))
     if gap > reach:
         return True
+    if role == REAL and paint == 0:
+        return False
     change = wp.length(points.base_color[i] - points.base_color[j])
     return change > 0.1
 
 
 @wp.kernel
-def _mark_edges(first: int, points: Points, width: int, height: int, mark_out: wp.array(dtype=wp.int32)):
-    """1 where any of the eight neighbours shows another surface."""
+def _mark_edges(
+    first: int, points: Points, width: int, height: int, paint: int, mark_out: wp.array(dtype=wp.int32)
+):
+    """1 where any of the eight neighbours shows another surface, or another colour (of real ones if ``paint``)."""
     i = first + wp.tid()
     x = i % width
     y = i / width
@@ -246,7 +250,7 @@ def _mark_edges(first: int, points: Points, width: int, height: int, mark_out: w
     for dy in range(-1, 2):
         for dx in range(-1, 2):
             if mark == 0 and x + dx >= 0 and x + dx < width and y + dy >= 0 and y + dy < height:
-                if differs(points, i, (y + dy) * width + x + dx):
+                if differs(points, i, (y + dy) * width + x + dx, paint):
                     mark = 1
     mark_out[i] = mark
 

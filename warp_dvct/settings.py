@@ -62,7 +62,7 @@ class Settings:
         0.25, "bound on the change within a stride beyond which it is halved; 0 for never", low=0.0, high=100.0
     )
     gather_change: float = _knob(
-        0.01,
+        0.02,
         "on a plate: least change of irradiance, as a share of it, for halving the stride; 0 for any",
         low=0.0,
         high=1.0,

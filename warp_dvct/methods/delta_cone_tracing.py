@@ -130,6 +130,7 @@ def render(
             plan.height,
             edge_samples=settings.antialias,
             behind=with_before,
+            paint=with_before or not scene.captured,
             seed=settings.seed,
             real=real,
         )

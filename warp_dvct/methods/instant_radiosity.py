@@ -271,6 +271,7 @@ class Shot:
                 plan.height,
                 edge_samples=plan.settings.antialias,
                 behind=with_before,
+                paint=with_before or not scene.captured,
                 seed=plan.settings.seed,
             )
         blender = None

@@ -60,6 +60,7 @@ def render_gbuffer(
     *,
     edge_samples: int,
     behind: bool,
+    paint: bool = True,
     seed: int = 0,
     real: tuple[Any, Any] | None = None,
 ) -> GBuffer:
@@ -68,6 +69,7 @@ def render_gbuffer(
     Args:
         edge_samples: Points per edge pixel, spread over its area (box filter); 0 for no anti-aliasing.
         behind: Whether the real surfaces hidden by synthetic ones are needed (where there is no plate).
+        paint: Whether colours make edges on real surfaces. A photograph that is their albedo holds means over pixels.
         real: What :func:`see_real` gave, where that is at hand; it is not written to.
     """
     pixels = width * height
@@ -79,7 +81,7 @@ def render_gbuffer(
         centers = seen
     mark = launcher.zeros(pixels, wp.int32)
     if edge_samples > 0:
-        launcher.launch(kernels._mark_edges, pixels, [centers, width, height], [mark])
+        launcher.launch(kernels._mark_edges, pixels, [centers, width, height, int(paint)], [mark])
     edge_rank, edge_pixel, edges = compact(launcher, mark)
     count = pixels + edges * edge_samples
     points = extended(launcher, centers, pixels, count)
