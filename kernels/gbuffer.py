@@ -239,9 +239,7 @@ def differs(points: Points, i: int, j: int, paint: int) -> bool:
 
 
 @wp.kernel
-def _mark_edges(
-    first: int, points: Points, width: int, height: int, paint: int, mark_out: wp.array(dtype=wp.int32)
-):
+def _mark_edges(first: int, points: Points, width: int, height: int, paint: int, mark_out: wp.array(dtype=wp.int32)):
     """1 where any of the eight neighbours shows another surface, or another colour (of real ones if ``paint``)."""
     i = first + wp.tid()
     x = i % width
