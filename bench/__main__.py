@@ -253,6 +253,7 @@ def motion(stage: str, pairs: tuple[str, ...], json_file: Path | None, spp: int,
 @click.option("--tracked", type=int, default=20, show_default=True, help="Frames that are tracked; 0 for none.")
 @click.option("--quality", default="balanced", show_default=True, help="Of the relit pictures.")
 @click.option("--pictures", type=int, default=2, show_default=True, help="How many are compared with the truth's.")
+@click.option("--live", type=click.Path(path_type=Path), help="A dataset's folder: relit from live depth as well.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda:N.")
 @click.option("--threads", type=int, help="CPU threads; all cores by default.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file too.")

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_dvct.bench.error import stage_file
+from warp_dvct.bench.live_capture import time_dataset, time_live
 from warp_dvct.capture.frames import FrameList, Skipped
 from warp_dvct.capture.fusion import (
     FusedMesh,
@@ -50,6 +51,7 @@ class CaptureOptions:
         frames: Of the capture. width: Pixels across.
         voxel: Metres. tracked: Frames that are tracked; 0 for none.
         quality: Of the relit pictures. pictures: How many are compared.
+        live: A dataset whose frames are relit from live depth as well.
         device, threads: Where.
     """
 
@@ -59,6 +61,7 @@ class CaptureOptions:
     tracked: int = 20
     quality: str = "balanced"
     pictures: int = 2
+    live: Path | None = None
     device: str = "cpu"
     threads: int | None = None
 
@@ -89,6 +92,7 @@ def measure(stage: str, options: CaptureOptions) -> Report:
         done = simulate(file, folder, asked, device=options.device, threads=options.threads)
         capture = open_capture(done.capture)
         _time_filter(capture, options, report)
+        _time_live(file, capture, options, report)
         _time_tracking(capture, options, report)
         fusion = FusionOptions(voxel=options.voxel)
         with _timed(report, "fusion, meshing and cleaning", len(capture)):
@@ -132,6 +136,14 @@ def _time_filter(capture: Capture, options: CaptureOptions, report: Report) -> N
         for depth, pose in images[2:]:
             assert pose is not None
             made.update(depth, pose)
+
+
+def _time_live(stage: Path, capture: Capture, options: CaptureOptions, report: Report) -> None:
+    how = {"quality": options.quality, "device": options.device, "threads": options.threads}
+    found = {"relit from live depth": time_live(stage, capture, **how)}
+    if options.live is not None:
+        found[f"the same, {options.live.name}"] = time_dataset(options.live, **how)
+    report.milliseconds.update({name: (1e3 * wall, 1e3 * processor) for name, (wall, processor) in found.items()})
 
 
 def _time_tracking(capture: Capture, options: CaptureOptions, report: Report) -> None:
