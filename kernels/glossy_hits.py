@@ -55,7 +55,7 @@ def divided(a: wp.vec3, b: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def domes_in_lobe(hits: GlossyHits, geo: Geometry, env: Environment, s: Surface, wo: wp.vec3) -> Sent:
+def domes_in_lobe(geo: Geometry, env: Environment, s: Surface, wo: wp.vec3) -> Sent:
     """The environment around the mirror direction, over the lobe's solid angle, where the direction is open."""
     sent = Sent()
     direction = wp.normalize(s.normal * (2.0 * wp.dot(s.normal, wo)) - wo)
@@ -73,23 +73,31 @@ def domes_in_lobe(hits: GlossyHits, geo: Geometry, env: Environment, s: Surface,
 
 @wp.func
 def lights_in_lobe(
-    hits: GlossyHits, geo: Geometry, s: Surface, wo: wp.vec3, faint: float, with_before: int, sample: int
+    geo: Geometry,
+    lights: Lights,
+    s: Surface,
+    wo: wp.vec3,
+    faint: float,
+    with_before: int,
+    seed: int,
+    index: int,
+    sample: int,
 ) -> Sent:
-    """Finite lights reflected by the lobe, by shadow rays; less than ``faint`` is left out.
+    """Radiance of the finite lights reflected by the lobe, by shadow rays; less than ``faint`` is left out.
 
     One sample of each light and one of the lobe share the work by the power heuristic (Veach 1997): where the light
     covers more than the lobe, samples of the light alone would be rare and far too bright.
     """
     sent = Sent()
-    bounce = reflect_visible(s, wo, sobol2(hits.seed, 0, sample, 59))
+    bounce = reflect_visible(s, wo, sobol2(seed, index, sample, 59))
     bounce_density = vndf_pdf(s, wo, bounce)
     bounce_weight = wp.vec3(0.0, 0.0, 0.0)
     if bounce_density > 0.0 and wp.dot(bounce, s.normal_g) > 0.0:
         bounce_weight = brdf_cos_specular(s, wo, bounce) / bounce_density
-    for k in range(hits.lights.count):
-        if hits.lights.kind[k] != DOME:
-            real_before = with_before != 0 and hits.lights.role[k] != ADDED
-            light = sample_light(hits.lights, k, s.position, sobol2(hits.seed, 0, sample, 2 * k + 61))
+    for k in range(lights.count):
+        if lights.kind[k] != DOME:
+            real_before = with_before != 0 and lights.role[k] != ADDED
+            light = sample_light(lights, k, s.position, sobol2(seed, index, sample, 2 * k + 61))
             f = wp.cw_mul(brdf_cos_specular(s, wo, light.direction), light.value)
             if light.pdf > 0.0:
                 f *= power_share(light.pdf, vndf_pdf(s, wo, light.direction))
@@ -100,7 +108,7 @@ def lights_in_lobe(
                 if real_before:
                     sent.before += f * sight.before
             origin = spawn_point(s, bounce)
-            met = light_along_ray(hits.lights, k, origin, bounce)
+            met = light_along_ray(lights, k, origin, bounce)
             if met.pdf > 0.0:
                 f = wp.cw_mul(bounce_weight, met.radiance) * power_share(bounce_density, met.pdf)
                 if wp.max(f[0], wp.max(f[1], f[2])) > faint:
@@ -156,8 +164,8 @@ def focused(
     share = divided(specular, hemispherical_albedo_specular(s))  # widening costs energy at grazing angles
     brightest = wp.max(even.after, even.before)
     faint = NEGLIGIBLE / PI * wp.max(brightest[0], wp.max(brightest[1], brightest[2]))
-    lit = lights_in_lobe(hits, geo, s, wo, faint, with_before, sample)
-    sky = domes_in_lobe(hits, geo, env, s, wo)
+    lit = lights_in_lobe(geo, hits.lights, s, wo, faint, with_before, hits.seed, 0, sample)
+    sky = domes_in_lobe(geo, env, s, wo)
     sent = Sent()
     sent.before = (
         wp.cw_mul(keep, even.before)

@@ -9,19 +9,21 @@ import warp as wp
 from warp_dvct.kernels.environment import Environment, environment_radiance
 from warp_dvct.kernels.gbuffer import BACKGROUND, REAL, SYNTHETIC, Points, load_surface
 from warp_dvct.kernels.geometry import FAR, Geometry, trace_real, trace_synthetic
+from warp_dvct.kernels.glossy_hits import domes_in_lobe, lights_in_lobe
 from warp_dvct.kernels.ism import AFTER, ALL, CHANGE, RAY_END, Sight, map_sight, ray_sight
 from warp_dvct.kernels.lights import ADDED, DOME, Lights, sample_light
 from warp_dvct.kernels.materials import (
     Materials,
     Surface,
-    brdf_cos,
+    brdf_cos_diffuse,
     brdf_cos_specular,
     hemispherical_albedo,
+    hemispherical_albedo_diffuse,
     spawn_point,
     surface_at,
 )
 from warp_dvct.kernels.sampling import INV_PI, sobol2, uniform1
-from warp_dvct.kernels.shading import Direct, reflect_visible, reflected, vndf_pdf
+from warp_dvct.kernels.shading import SHADOW_END, Direct, look, reflect_visible, reflected, vndf_pdf
 from warp_dvct.kernels.specular import Glossy, lights_along
 from warp_dvct.kernels.vpls import SKY, Vpls
 
@@ -272,39 +274,53 @@ def _shade_direct_single(
 def lit_surface(
     geo: Geometry,
     lights: Lights,
+    env: Environment,
     vpls: Vpls,
     sight: Sight,
     s: Surface,
     wo: wp.vec3,
     want_before: int,
     want_after: int,
-    seed: int,
+    glossy: Glossy,
     index: int,
     sample: int,
 ) -> Pair:
-    """Radiance that a surface met by a glossy ray sends back: one sample of each light, and a few of the VPLs."""
+    """Radiance that a surface met by a glossy ray sends back: one sample of each light, the lights and the sky in its
+    own lobe, and a few of the VPLs. What is not wanted may come out as anything."""
     out = Pair()
     out.before = wp.vec3(0.0, 0.0, 0.0)
     out.after = wp.vec3(0.0, 0.0, 0.0)
     for k in range(lights.count):
         if lights.kind[k] != DOME:
-            light = sample_light(lights, k, s.position, sobol2(seed, index, sample, 60 + k))
-            f = wp.cw_mul(brdf_cos(s, wo, light.direction), light.value)
+            light = sample_light(lights, k, s.position, sobol2(glossy.seed, index, sample, 2 * k + 62))
+            f = wp.cw_mul(brdf_cos_diffuse(s, wo, light.direction), light.value)
             if wp.max(f[0], wp.max(f[1], f[2])) > 0.0:
-                reach = light.distance * RAY_END
-                exact = sight
-                exact.single = 0
-                open = ray_sight(geo, exact, spawn_point(s, light.direction), light.direction, reach, 1, ALL)
-                if want_before != 0 and lights.role[k] != ADDED:
-                    out.before += f * open[0]
-                if want_after != 0:
-                    out.after += f * wp.min(open[0], open[1])
+                origin = spawn_point(s, light.direction)
+                seen = look(geo, origin, light.direction, light.distance * SHADOW_END, want_before, True)
+                if lights.role[k] != ADDED:
+                    out.before += f * seen.before
+                out.after += f * seen.after
+    narrow = s.f90 > 0.0 and s.alpha <= glossy.alpha_max
+    if s.f90 > 0.0:
+        lobe = lights_in_lobe(geo, lights, s, wo, 0.0, want_before, glossy.seed, index, sample)
+        out.before += lobe.before
+        out.after += lobe.after
+    if narrow:
+        lobe = domes_in_lobe(geo, env, s, wo)
+        out.before += lobe.before
+        out.after += lobe.after
     if vpls.count > 0:
         stride = wp.max(vpls.count / GLOSSY_VPLS, 1)
-        reflectance = hemispherical_albedo(s) * (INV_PI * float(stride))
-        j = int(uniform1(seed, index, sample, 59) * float(stride))
+        share = INV_PI * float(stride)
+        diffuse = hemispherical_albedo_diffuse(s) * share
+        both = hemispherical_albedo(s) * share
+        j = int(uniform1(glossy.seed, index, sample, 58) * float(stride))
         while j < vpls.count:
             bounced = vpl_irradiance(geo, vpls, j, s, sight, want_before, want_after, 0)
+            # The lobe has seen the sky already.
+            reflectance = both
+            if narrow and vpls.kind[j] == SKY:
+                reflectance = diffuse
             out.before += wp.cw_mul(reflectance, bounced.before)
             out.after += wp.cw_mul(reflectance, bounced.after)
             j += stride
@@ -356,7 +372,7 @@ def _shade_glossy(
             if real.found != 0 and glossy.again != 0 and (share_after != 0 or is_real != 0):
                 met = surface_at(geo, mats, real, origin, direction)
                 seen = lit_surface(
-                    geo, lights, vpls, sight, met, -direction, is_real, share_after, glossy.seed, j, 2 * k
+                    geo, lights, env, vpls, sight, met, -direction, is_real, share_after, glossy, j, 2 * k
                 )
             elif real.found == 0 and env.levels > 0:
                 seen.before = environment_radiance(env, direction, 1.0 / density, 0)
@@ -365,7 +381,7 @@ def _shade_glossy(
                 seen.after = wp.vec3(0.0, 0.0, 0.0)
             if synthetic.found != 0 and glossy.again != 0:
                 met = surface_at(geo, mats, synthetic, origin, direction)
-                inserted = lit_surface(geo, lights, vpls, sight, met, -direction, 0, 1, glossy.seed, j, 2 * k + 1)
+                inserted = lit_surface(geo, lights, env, vpls, sight, met, -direction, 0, 1, glossy, j, 2 * k + 1)
                 seen.after = inserted.after
             lamps = lights_along(lights, origin, direction, synthetic.t, density, samples, 1)
             after += wp.cw_mul(weight, seen.after + lamps)
