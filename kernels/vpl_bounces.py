@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_dvct.kernels.geometry import OFFSET_RELATIVE, Geometry
+from warp_dvct.kernels.geometry import OFFSET_RELATIVE, Geometry, occluded_by_real, occluded_by_synthetic
 from warp_dvct.kernels.ism import ALL, RAY_END, Cloud, Sight, map_sight, ray_sight
 from warp_dvct.kernels.sampling import INV_PI, luminance, sobol1, uniform1
 from warp_dvct.kernels.vpls import SURFACE, Vpls
@@ -10,6 +10,7 @@ from warp_dvct.kernels.vpls import SURFACE, Vpls
 wp.set_module_options({"enable_backward": False})
 
 NEAREST = wp.constant(1.0e-12)
+ONE_PLANE = wp.constant(0.1)  # of the offset of rays: what a distance within it may be by rounding
 
 
 @wp.struct
@@ -58,6 +59,20 @@ def find_source(cdf: wp.array(dtype=wp.float32), count: int, u: float) -> int:
 
 
 @wp.func
+def covered(geo: Geometry, position: wp.vec3, normal: wp.vec3, synthetic: int, reach: float) -> bool:
+    """Whether a surface of the other role lies on a point, or in front of it by less than where its rays begin.
+
+    Those rays do not meet it, and the light of one place would be counted on both. Of faces in one plane the real one
+    has the light, as it is the one that the camera sees.
+    """
+    off = OFFSET_RELATIVE * reach
+    origin = position + normal * off
+    if synthetic != 0:
+        return occluded_by_real(geo, origin, -normal, off * (1.0 + ONE_PLANE))
+    return occluded_by_synthetic(geo, origin, -normal, off * (1.0 - ONE_PLANE))
+
+
+@wp.func
 def light_point(
     geo: Geometry, vpls: Vpls, sight: Sight, k: int, position: wp.vec3, normal_in: wp.vec3, synthetic: int, reach: float
 ) -> Candidate:
@@ -85,6 +100,10 @@ def light_point(
         open = map_sight(vpls, k, sight, origin)
     if open[0] == 0.0:
         return out
+    if covered(geo, position, normal, synthetic, reach):
+        if synthetic != 0:
+            return out
+        open[1] = 0.0
     light = vpls.flux[k] * (form * INV_PI / (d2 + vpls.spread[k] * vpls.spread[k]))
     if vpls.hidden[k] != 0:
         out.real = 1
