@@ -29,6 +29,8 @@ from warp_dvct.kernels.volume import Volume
 wp.set_module_options({"enable_backward": False})
 
 UNLIT_MARGIN = wp.constant(1.0e-4)  # of a distance or cosine: keeps rounding from culling a light at the horizon
+BOX_MARGIN = wp.constant(1.0e-5)  # of the lengths compared: keeps rounding from culling what a box barely meets
+SPHERE_MARGIN = wp.constant(1.002)  # of a squared radius, to the same end
 SHADOW_END = wp.constant(0.9999)  # of the way to the light: a surface that the light lies on does not shadow it
 
 
@@ -43,8 +45,8 @@ class Direct:
     alpha_max: wp.float32  # roughest GGX alpha that the specular pass treats
     with_before: wp.int32  # 1: also the radiance before, on every real point (it becomes the plate)
     seed: wp.int32
-    center: wp.vec3  # bounding sphere of the synthetic objects
-    radius: wp.float32
+    center: wp.vec3  # box around the synthetic objects: its middle
+    extent: wp.vec3  # and half its edges
 
 
 @wp.func
@@ -80,25 +82,61 @@ def highlight_weight(s: Surface, wo: wp.vec3, light: LightSample, direct: Direct
 
 
 @wp.func
+def beyond(normal: wp.vec3, toward: wp.vec3, extent: wp.vec3) -> bool:
+    """Whether a box is wholly on the positive side of a plane through a point; ``toward`` leads to its middle."""
+    nearest = wp.dot(toward, normal) - wp.dot(extent, wp.abs(normal))
+    return nearest > BOX_MARGIN * wp.length(normal) * (wp.length(toward) + wp.length(extent))
+
+
+@wp.func
+def beyond_sides(lights: Lights, i: int, to_light: wp.vec3, toward: wp.vec3, extent: wp.vec3) -> bool:
+    """Whether a box is outside a side of the pyramid that the parallelogram of a RECT or DISK spans with a point."""
+    ax = lights.axis_x[i]
+    ay = lights.axis_y[i]
+    turn = wp.sign(wp.dot(wp.cross(ax, ay), to_light))
+    return (
+        beyond(wp.cross(to_light + ay, ax) * turn, toward, extent)
+        or beyond(wp.cross(to_light - ay, ax) * -turn, toward, extent)
+        or beyond(wp.cross(to_light + ax, ay) * -turn, toward, extent)
+        or beyond(wp.cross(to_light - ax, ay) * turn, toward, extent)
+    )
+
+
+@wp.func
 def may_shadow(lights: Lights, i: int, position: wp.vec3, direct: Direct) -> bool:
-    """Whether the cone from a point to a light's bounding sphere meets the synthetic objects' bounding sphere."""
+    """Whether the box around the synthetic objects may meet a segment from a point to a light.
+
+    False only where a plane parts the box from the hull of point and light: one across the way to the box, a side of
+    the pyramid over a planar light, or a face of the box.
+    """
     toward = direct.center - position
-    distance = wp.length(toward)
-    if distance <= direct.radius:
-        return True
-    size = wp.asin(wp.min(direct.radius / distance, 1.0))
     axis = -lights.direction[i]
-    spread = wp.acos(wp.clamp(1.0 - lights.cap[i], -1.0, 1.0))
+    sine2 = lights.cap[i] * (2.0 - lights.cap[i])
     if lights.kind[i] != DISTANT:
         to_light = lights.position[i] - position
-        far = wp.length(to_light)
-        bound = lights.radius[i] + wp.length(lights.axis_x[i]) + wp.length(lights.axis_y[i])
-        if far <= bound or distance - direct.radius > far + bound:
-            return far <= bound
-        axis = to_light / far
-        spread = wp.asin(bound / far)
-    angle = wp.acos(wp.clamp(wp.dot(axis, toward) / distance, -1.0, 1.0))
-    return angle <= size + spread + 1.0e-3
+        far2 = wp.length_sq(to_light)
+        size = wp.abs(lights.axis_x[i]) + wp.abs(lights.axis_y[i])
+        bound = lights.radius[i] + wp.length(size)
+        if far2 <= bound * bound:
+            return True
+        size = size + wp.vec3(lights.radius[i], lights.radius[i], lights.radius[i])
+        gap = wp.max(wp.vec3(0.0, 0.0, 0.0), to_light + size)
+        room = direct.extent + BOX_MARGIN * (wp.abs(toward) + wp.abs(to_light) + size + direct.extent)
+        if toward[0] - room[0] > gap[0] or toward[1] - room[1] > gap[1] or toward[2] - room[2] > gap[2]:
+            return False
+        gap = wp.min(wp.vec3(0.0, 0.0, 0.0), to_light - size)
+        if toward[0] + room[0] < gap[0] or toward[1] + room[1] < gap[1] or toward[2] + room[2] < gap[2]:
+            return False
+        if lights.kind[i] == RECT or lights.kind[i] == DISK:
+            if beyond_sides(lights, i, to_light, toward, direct.extent):
+                return False
+        axis = to_light / wp.sqrt(far2)
+        sine2 = bound * bound / far2
+    elif lights.cap[i] >= 1.0:
+        return True
+    # All ways to the light are within a cone; this plane touches it on the side of the box.
+    across = wp.normalize(toward - axis * wp.dot(toward, axis))
+    return not beyond(across * wp.sqrt(1.0 - sine2) - axis * wp.sqrt(sine2), toward, direct.extent)
 
 
 @wp.func
@@ -159,10 +197,10 @@ def unlit(lights: Lights, k: int, s: Surface) -> bool:
 
 @wp.func
 def meets_objects(origin: wp.vec3, direction: wp.vec3, reach: float, direct: Direct) -> bool:
-    """Whether a ray passes the synthetic objects' bounding sphere: much cheaper to ask than their triangles."""
+    """Whether a ray passes the sphere around the synthetic objects: much cheaper to ask than their triangles."""
     to_center = direct.center - origin
     along = wp.clamp(wp.dot(to_center, direction), 0.0, reach)
-    return wp.length_sq(to_center - direction * along) <= direct.radius * direct.radius
+    return wp.length_sq(to_center - direction * along) <= SPHERE_MARGIN * wp.length_sq(direct.extent)
 
 
 @wp.struct

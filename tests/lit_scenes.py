@@ -16,6 +16,7 @@ from warp_dvct.launch import Launcher
 from warp_dvct.methods.delta_cone_tracing import _normals, _world
 from warp_dvct.passes.gbuffer import new_points
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
+from warp_dvct.passes.shading import bound_objects
 from warp_dvct.passes.voxels import Box, Voxels, voxelize
 from warp_dvct.scene import Camera, Light, Material, Mesh, Role, Scene
 
@@ -251,7 +252,7 @@ def cone_settings(escape: str = "ray", **more: Any) -> Any:
 
 
 def direct_settings(scene: Scene, *, samples: int = 1, probes: int | None = None, with_before: bool = True) -> Any:
-    """Settings of the direct pass without a specular pass, with the bounding sphere of the synthetic objects."""
+    """Settings of the direct pass without a specular pass, with the box around the synthetic objects."""
     direct = shading.Direct()
     direct.samples, direct.probes = samples, samples if probes is None else probes
     direct.edge_samples = 1
@@ -259,6 +260,5 @@ def direct_settings(scene: Scene, *, samples: int = 1, probes: int | None = None
     direct.with_before = int(with_before)
     bounds = scene.bounds(Role.SYNTHETIC)
     if bounds is not None:
-        direct.center = wp.vec3(*(0.5 * (bounds[0] + bounds[1])))
-        direct.radius = 0.5 * float(np.linalg.norm(bounds[1] - bounds[0])) * 1.001
+        bound_objects(direct, *bounds)
     return direct

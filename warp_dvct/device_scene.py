@@ -7,6 +7,7 @@ irradiance are invariant, and the radiant intensity of POINT lights is multiplie
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -101,6 +102,12 @@ class DeviceScene:
     def synthetic_first(self) -> int:
         """Index of the first synthetic triangle in the per-triangle arrays."""
         return int(self.geometry.synthetic_first)
+
+    @cached_property
+    def synthetic_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Box (low, high) in volume space around the synthetic triangles, of which there must be some."""
+        corners = self.triangles_vs[self.synthetic_first :].reshape(-1, 3)
+        return tuple(np.array([end(corners[:, k]) for k in range(3)]) for end in (np.min, np.max))
 
 
 @dataclass(frozen=True)

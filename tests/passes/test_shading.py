@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_dvct.passes.shading import shade_direct
+from warp_dvct.passes.shading import bound_objects, shade_direct
 from warp_dvct.scene import Light, LightKind, LightRole, Role
 
 L = np.array([2.0, 3.0, 4.0])
@@ -128,8 +128,8 @@ LARGE = LIGHTS | {
 
 
 @pytest.mark.parametrize("name", LARGE)
-def test_culling_by_bounding_spheres_changes_nothing(launcher, name):
-    """The synthetic objects' sphere only saves rays: as if it were endless, from every side of the light."""
+def test_culling_by_a_box_changes_nothing(launcher, name):
+    """The box around the synthetic objects only saves rays: as if it were endless, from every side of the light."""
     rng = np.random.default_rng(8)
     middle = rng.uniform(0.4, 0.6, 3)
     objects = [lit.mesh(lit.ball(middle + 0.04 * k * lit.EYES[1], 0.02, 8), Role.SYNTHETIC) for k in range(2)]
@@ -144,7 +144,7 @@ def test_culling_by_bounding_spheres_changes_nothing(launcher, name):
         direct = lit.direct_settings(scene, samples=16, with_before=False)
         culled = shaded(launcher, scene, points, 1500, direct=direct)[0]
         direct = lit.direct_settings(scene, samples=16, with_before=False)
-        direct.center, direct.radius = wp.vec3(0.0, 0.0, 0.0), 1e6
+        bound_objects(direct, np.full(3, -1e6), np.full(3, 1e6))
         np.testing.assert_array_equal(culled, shaded(launcher, scene, points, 1500, direct=direct)[0])
         any_shadow |= bool(culled.any())
     assert any_shadow

@@ -86,7 +86,6 @@ class Lighting:
         settings = Direct()
         settings.samples, settings.probes, settings.edge_samples = 16, 4, 1
         settings.with_before, settings.seed, settings.alpha_max = 1, self._seed, -1.0
-        settings.center, settings.radius = wp.vec3(0.0, 0.0, 0.0), 0.0
         light, before = launcher.zeros(count, wp.vec3), launcher.zeros(count, wp.vec3)
         shade_direct(launcher, self._device, self._points(at), count, settings, light=light, before=before)
         return np.pi * before.numpy()  # points have a diffuse albedo of 1, so radiance is E / pi

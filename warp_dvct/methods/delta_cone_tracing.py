@@ -38,7 +38,7 @@ from warp_dvct.passes.injection import empty_flux, inject
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
 from warp_dvct.passes.resolve import resolve
 from warp_dvct.passes.rsm import render_real, render_rsm
-from warp_dvct.passes.shading import shade_direct
+from warp_dvct.passes.shading import bound_objects, shade_direct
 from warp_dvct.passes.specular import find_glossy, shade_specular
 from warp_dvct.passes.voxels import Voxels, cut_triangles, part, voxelize
 from warp_dvct.plan import Plan
@@ -146,7 +146,7 @@ def render(
             parts.append(_Part(buffer.behind, buffer.behind_count, spare, hidden_before, True))
         for part in parts:
             with launcher.scope("direct"):
-                _shade_direct(launcher, scene, device_scene, plan, world, part)
+                _shade_direct(launcher, device_scene, plan, world, part)
             if _has_indirect(scene, plan):
                 with launcher.scope("gather"):
                     irradiance = _irradiance(launcher, device_scene, plan, world, hits, buffer, part, rays)
@@ -315,9 +315,7 @@ def _cone(plan: Plan, aperture: float = 0.0) -> Any:
     return cone
 
 
-def _shade_direct(
-    launcher: Launcher, scene: Scene, device_scene: DeviceScene, plan: Plan, world: Any, part: _Part
-) -> None:
+def _shade_direct(launcher: Launcher, device_scene: DeviceScene, plan: Plan, world: Any, part: _Part) -> None:
     settings = plan.settings
     direct = shading.Direct()
     direct.samples = settings.shadows_samples
@@ -327,13 +325,8 @@ def _shade_direct(
     direct.alpha_max = plan.alpha_max
     direct.with_before = int(part.with_before)
     direct.seed = settings.seed
-    bounds = scene.bounds(Role.SYNTHETIC)
-    if bounds is None:
-        direct.center, direct.radius = wp.vec3(0.0, 0.0, 0.0), 0.0
-    else:
-        low, high = ((b - device_scene.origin) * device_scene.scale for b in bounds)
-        direct.center = wp.vec3(*(0.5 * (low + high)))
-        direct.radius = 0.5 * float(np.linalg.norm(high - low)) * 1.001
+    if device_scene.synthetic is not None:
+        bound_objects(direct, *device_scene.synthetic_bounds)
     cone = None
     if settings.shadows == "cone":
         cone = _cone(plan)

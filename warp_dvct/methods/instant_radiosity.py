@@ -27,7 +27,7 @@ from warp_dvct.passes.history import Blender, History
 from warp_dvct.passes.ism import draw_isms, new_isms, ray_sight
 from warp_dvct.passes.point_cloud import SurfacePoints, sample_surfaces
 from warp_dvct.passes.resolve import resolve
-from warp_dvct.passes.shading import shade_direct
+from warp_dvct.passes.shading import bound_objects, shade_direct
 from warp_dvct.passes.specular import find_glossy
 from warp_dvct.passes.vpl_bounces import bounce_vpls
 from warp_dvct.passes.vpl_memory import check_memory
@@ -382,7 +382,7 @@ class _Shader:
 
     def _direct(self, points: Any, count: int, light: Any, before: Any) -> None:
         """Direct light of all but domes (eqs. 1-5)."""
-        direct = direct_settings(self.plan, self.lights.region, self.scene, self.with_before)
+        direct = direct_settings(self.plan, self.scene, self.device_scene, self.with_before)
         if self.plan.settings.shadow_maps == "single":
             shade_direct_single(
                 self.launcher,
@@ -419,7 +419,7 @@ def first_vpls(vpls: Any, count: int) -> Any:
     return fewer
 
 
-def direct_settings(plan: Plan, region: Region, scene: Scene, with_before: bool) -> Any:
+def direct_settings(plan: Plan, scene: Scene, device_scene: DeviceScene, with_before: bool) -> Any:
     """``kernels.shading.Direct`` for exact shadow rays."""
     settings = plan.settings
     direct = shading.Direct()
@@ -430,8 +430,8 @@ def direct_settings(plan: Plan, region: Region, scene: Scene, with_before: bool)
     direct.alpha_max = plan.alpha_max
     direct.with_before = int(with_before)
     direct.seed = settings.seed
-    direct.center = wp.vec3(*region.focus)
-    direct.radius = region.focus_radius * 1.001 if scene.bounds(Role.SYNTHETIC) is not None else 0.0
+    if device_scene.synthetic is not None:
+        bound_objects(direct, *device_scene.synthetic_bounds)
     return direct
 
 
