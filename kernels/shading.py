@@ -5,6 +5,7 @@ import warp as wp
 from warp_dvct.kernels.cones import ConeSettings, march_cone
 from warp_dvct.kernels.gbuffer import (
     BACKGROUND,
+    REAL,
     SYNTHETIC,
     UNSEEN,
     Points,
@@ -180,16 +181,16 @@ def look(geo: Geometry, origin: wp.vec3, direction: wp.vec3, reach: float, need_
 
 
 @wp.func
-def unlit(lights: Lights, k: int, s: Surface) -> bool:
+def unlit(lights: Lights, k: int, position: wp.vec3, normal: wp.vec3) -> bool:
     """Whether a light lies wholly behind a surface or emits away from it, and so sends nothing, whatever is between."""
     if lights.kind[k] == DISTANT:
         # The sine of the half angle follows from its cap: the square is cap times (2 - cap).
         cap = lights.cap[k]
-        return -wp.dot(lights.direction[k], s.normal_g) < -wp.sqrt(wp.max(cap * (2.0 - cap), 0.0)) - UNLIT_MARGIN
-    to_light = lights.position[k] - s.position
+        return -wp.dot(lights.direction[k], normal) < -wp.sqrt(wp.max(cap * (2.0 - cap), 0.0)) - UNLIT_MARGIN
+    to_light = lights.position[k] - position
     bound = lights.radius[k] + wp.length(lights.axis_x[k]) + wp.length(lights.axis_y[k])
     margin = UNLIT_MARGIN * (bound + wp.length(to_light))
-    if wp.dot(to_light, s.normal_g) < -bound - margin:
+    if wp.dot(to_light, normal) < -bound - margin:
         return True
     planar = lights.kind[k] == RECT or lights.kind[k] == DISK
     return planar and wp.dot(to_light, lights.direction[k]) > margin
@@ -319,6 +320,16 @@ def light_part(
     return part
 
 
+@wp.func
+def may_change(lights: Lights, position: wp.vec3, normal: wp.vec3, direct: Direct) -> bool:
+    """Whether any light but domes may differ between before and after at a real surface."""
+    for k in range(lights.count):
+        if lights.kind[k] != DOME and not unlit(lights, k, position, normal):
+            if lights.role[k] == ADDED or may_shadow(lights, k, position, direct):
+                return True
+    return False
+
+
 @wp.kernel
 def _shade_direct(
     first: int,
@@ -338,13 +349,17 @@ def _shade_direct(
         before_out[i] = wp.vec3(0.0, 0.0, 0.0)
     if role == BACKGROUND or points.slot[i] == UNSEEN:
         return
+    # Asked before the rest of the surface is loaded: at most points of a picture the answer is no.
+    if role == REAL and direct.with_before == 0:
+        if not may_change(lights, points.position[i], points.normal_g[i], direct):
+            return
     s = load_surface(points, i)
     wo = points.view[i]
     draw = draw_of(points, i, direct)
     total = wp.vec3(0.0, 0.0, 0.0)
     before = wp.vec3(0.0, 0.0, 0.0)
     for k in range(lights.count):
-        if lights.kind[k] != DOME and not unlit(lights, k, s):
+        if lights.kind[k] != DOME and not unlit(lights, k, s.position, s.normal_g):
             added = lights.role[k] == ADDED
             shadowed = may_shadow(lights, k, s.position, direct)
             if role == SYNTHETIC or added or direct.with_before != 0 or shadowed:
