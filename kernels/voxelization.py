@@ -495,11 +495,14 @@ def _count_up(first: int, order_out: wp.array(dtype=wp.int32)):
 
 @wp.kernel
 def _find_end(first: int, key_in: wp.array(dtype=wp.int32), count: int, end_out: wp.array(dtype=wp.int32)):
-    """The number of sorted keys before EMPTY_KEY; one thread alone finds itself at the border."""
+    """The number of sorted keys before EMPTY_KEY, by halving; one element."""
     i = first + wp.tid()
-    if key_in[i] != EMPTY_KEY:
-        last = i + 1 == count
-        if not last:
-            last = key_in[i + 1] == EMPTY_KEY
-        if last:
-            end_out[0] = i + 1
+    low = int(0)
+    high = int(count)
+    while low < high:
+        middle = (low + high) / 2
+        if key_in[middle] == EMPTY_KEY:
+            high = middle
+        else:
+            low = middle + 1
+    end_out[i] = low

@@ -23,7 +23,14 @@ from warp_dvct.check import Checker, poison
 from warp_dvct.errors import DeviceError, OptionError
 
 SLABS_PER_THREAD = 8  # enough that an uneven slab does not leave the other threads idle
-MIN_SLAB = 256  # below this the 30 us of a launch outweigh the work
+MIN_SLAB_SECONDS = (
+    1.0e-4  # less work is not worth handing to another thread
+)
+FIRST_GUESS = 1.0e-6  # seconds an element, of a kernel that has not run
+FORGETTING = 0.7  # of the dearest launch so far, per launch: kernels are launched with light and heavy elements in turn
+
+# Seconds an element took in each kernel's launches so far, by kernel and device: they decide the slabs, never a result.
+_element_seconds: dict[tuple[Any, str], float] = {}
 
 
 class Launcher:
@@ -68,12 +75,19 @@ class Launcher:
             self.checker.after(self._scope_name(), kernel, count, inputs, outputs, self.device)
 
     def _launch_all(self, kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
-        slab = count
-        if self._pool is not None:
-            slab = max(MIN_SLAB, -(-count // (self.threads * SLABS_PER_THREAD)))
-        if slab >= count:
+        begun = time.thread_time()
+        key = kernel, self.device.alias
+        cost = _element_seconds.get(key, FIRST_GUESS)
+        slabs = 1 if self._pool is None else min(self.threads * SLABS_PER_THREAD, int(count * cost / MIN_SLAB_SECONDS))
+        if slabs <= 1:
             self._launch_slab(kernel, 0, count, inputs, outputs)
-            return
+            spent = time.thread_time() - begun
+        else:
+            spent = self._launch_parallel(kernel, -(-count // slabs), count, inputs, outputs)
+        _element_seconds[key] = max(spent / count, FORGETTING * cost)
+
+    def _launch_parallel(self, kernel: wp.Kernel, slab: int, count: int, inputs, outputs) -> float:
+        """Launch in slabs of ``slab`` elements; the processor seconds of all."""
         assert self._pool is not None
         waiting = deque(range(0, count, slab))
         workers = [
@@ -81,8 +95,7 @@ class Launcher:
             for _ in range(min(self.threads, len(waiting)))
         ]
         try:
-            for worker in workers:
-                worker.result()
+            return sum(worker.result() for worker in workers)
         finally:
             # After an interrupt the caller frees its arrays: no slab may still be writing to them.
             waiting.clear()
@@ -113,8 +126,12 @@ class Launcher:
             self._launch_slab(kernel, 0, count, inputs, outputs)
         tape.backward(grads=seeds)
 
-    def _launch_slabs(self, kernel, waiting: deque[int], slab: int, count: int, inputs, outputs) -> None:
-        """Take slabs until none is left. A recorded launch costs a fifth of a new one, and both hold Python's lock."""
+    def _launch_slabs(self, kernel, waiting: deque[int], slab: int, count: int, inputs, outputs) -> float:
+        """Take slabs until none is left; the processor seconds that took.
+
+        A recorded launch costs a fifth of a new one, and both hold Python's lock.
+        """
+        begun = time.thread_time()
         command: Any = wp.launch(
             kernel, dim=slab, inputs=[0, *inputs], outputs=list(outputs), device=self.device, record_cmd=True
         )
@@ -122,7 +139,7 @@ class Launcher:
             try:
                 start = waiting.popleft()
             except IndexError:
-                return
+                return time.thread_time() - begun
             command.set_param_at_index(0, start)
             command.set_dim(min(slab, count - start))
             command.launch()

@@ -212,8 +212,8 @@ def count_below(launcher: Launcher, key: Any, count: int) -> int:
     """Entries of a sorted key array that are not EMPTY_KEY."""
     if count == 0:
         return 0
-    found = launcher.zeros(1, wp.int32)
-    launcher.launch(kernels._find_end, count, [key, count], [found])
+    found = launcher.empty(1, wp.int32)
+    launcher.launch(kernels._find_end, 1, [key, count], [found])
     return int(found.numpy()[0])
 
 
