@@ -185,6 +185,7 @@ def _fill_slots(
     candidates: Candidates,
     chosen_in: wp.array(dtype=wp.int32),
     gain_in: wp.array(dtype=wp.float32),
+    strongest: int,
     start: int,
     reach: float,
     vpls: Vpls,
@@ -201,3 +202,7 @@ def _fill_slots(
     vpls.real[at] = candidates.real[p]
     vpls.hidden[at] = candidates.hidden[p]
     vpls.spread[at] = 0.0
+    if strongest != 0:
+        # Its neighbours do not tell its share of the surface, as they lie where light is strong. Its flux over the
+        # radiosity of its place does.
+        vpls.spread[at] = wp.sqrt(gain_in[i] * cloud.area[p] * INV_PI)

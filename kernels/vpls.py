@@ -215,9 +215,12 @@ def _choose_sky(first: int, env: Environment, chain: Chain, added: int, count: i
 def _spread_vpls(first: int, vpls: Vpls, start: int, count: int, scale: float, limit: float):
     """Radius of the disc that a VPL stands for, from the distance of its fourth neighbour on a like surface.
 
-    As many VPLs as lie within that distance share its disc's area, so it falls as they grow in number.
+    As many VPLs as lie within that distance share its disc's area, so it falls as they grow in number. What a VPL has
+    for a radius, where it has one, is the largest: one that stands alone among its class may be small all the same.
     """
     i = start + first + wp.tid()
+    if vpls.spread[i] > 0.0:
+        limit = wp.min(limit, vpls.spread[i] * wp.sqrt(float(NEIGHBOURS)))
     near = wp.vec4(limit, limit, limit, limit)
     for j in range(start, start + count):
         if j != i and vpls.real[j] == vpls.real[i] and wp.dot(vpls.normal[i], vpls.normal[j]) > SAME_SIDE:

@@ -36,7 +36,7 @@ def random_vpls(launcher: Any, twin: Twin) -> tuple[Any, dict[str, np.ndarray]]:
         "position": rng.uniform(0.25, 0.75, (VPLS, 3)),
         "normal": from_frame(cosine_hemisphere(rng.random((VPLS, 2))), np.tile([0.0, -1.0, 0.0], (VPLS, 1))),
         "flux": rng.uniform(0, 1, (VPLS, 3)),
-        "spread": rng.uniform(0.01, 0.1, VPLS),
+        "spread": rng.uniform(0.01, 0.1, VPLS) * (np.arange(VPLS) % 2),
         "real": rng.integers(0, 2, VPLS),
         "hidden": rng.integers(0, 2, VPLS),
     }
@@ -85,11 +85,12 @@ def measure_vpls(launcher: Any) -> list[Deviation]:
 
 
 def spread_row(launcher: Any, vpls: Any, numbers: dict[str, np.ndarray]) -> Deviation:
-    """Half the distance of the fourth neighbour of the same kind that faces alike."""
+    """Half the distance of the fourth neighbour of the same kind that faces alike, and no more than it was."""
     launcher.launch(kernels._spread_vpls, VPLS, [vpls, 0, VPLS, 1.0, 0.3])
     apart = np.linalg.norm(numbers["position"][:, None] - numbers["position"][None], axis=-1)
     like = (numbers["normal"] @ numbers["normal"].T > 0.7) & (numbers["real"][:, None] == numbers["real"][None])
-    apart = np.where(like & ~np.eye(VPLS, dtype=bool), np.minimum(apart, 0.3), 0.3)
+    most = np.where(numbers["spread"] > 0.0, np.minimum(0.3, 2.0 * numbers["spread"]), 0.3)[:, None]
+    apart = np.where(like & ~np.eye(VPLS, dtype=bool), np.minimum(apart, most), most)
     return compare(kernels._spread_vpls, "vpls.spread", vpls.spread.numpy(), np.sort(apart, 1)[:, 3] / 2.0)
 
 

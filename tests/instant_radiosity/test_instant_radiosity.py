@@ -242,7 +242,7 @@ def test_three_bounces_carry_the_right_light(launcher):
     for visibility, slots, clamp, tolerance in (
         ("ray", "drawn", 0.0, 0.06),
         ("ism", "drawn", 0.5, 0.15),
-        ("ray", "strongest", 0.5, 0.2),
+        ("ray", "strongest", 0.5, 0.15),
     ):
         lights = setup.lights(
             vpls_count=1024, vpls_further=512, visibility=visibility, vpls_slots=slots, vpls_clamp=clamp

@@ -84,6 +84,7 @@ def bounce_vpls(
                 member.candidates,
                 launcher.array(chosen.astype(np.int32), wp.int32),
                 launcher.array(gain.astype(np.float32), wp.float32),
+                int(strongest),
                 start + made,
                 reach,
                 vpls,

@@ -252,8 +252,11 @@ def spread_vpls(launcher: Launcher, vpls: Any, start: int, count: int, *, scale:
     """Set the radius of the disc that each of ``count`` VPLs from ``start`` on stands for; ``scale`` 0 clamps nothing.
 
     A VPL lights as a disc of that radius does on its axis, 1 / (d² + R²) for 1 / d²: bounded near surfaces, and
-    unbiased in the limit because R falls as the VPLs grow in number.
+    unbiased in the limit because R falls as the VPLs grow in number. No disc is larger than the one that it has
+    already, where it has one.
     """
     if scale > 0.0:
         limit = SPREAD_LIMIT * region.radius
         launcher.launch(kernels._spread_vpls, count, [vpls, start, count, scale, limit])
+    else:
+        vpls.spread[start : start + count].zero_()
