@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from warp_dvct.capture.enclosure import Enclosure, find_enclosure
 from warp_dvct.capture.frames import FrameSource, Skipped
 from warp_dvct.capture.fusion import FusedMesh, FusionOptions, fuse
 from warp_dvct.capture.scene_stage import SceneLights, write_scene
@@ -18,6 +19,7 @@ from warp_dvct.launch import Launcher
 from warp_dvct.scene import Camera, Light, LightKind, LightRole
 
 ALBEDOS = ("irradiance", "color")
+UNSEEN = ("auto", "room", "dome", "none")
 TOO_BRIGHT = 0.1  # share of vertices that would reflect more than they receive, from which it is said
 FUSION_SHARE = 0.6  # of the progress bar
 
@@ -33,6 +35,9 @@ class ReconstructOptions:
         probe: USD file with the real scene's lights.
         estimate_light: Fit the light to the shading, whatever lights the capture has.
         light: False to leave the light alone; albedo then is ``color``.
+        unseen: What stands for the parts that no frame has seen, where lamps are known and no dome is: ``room`` for a
+            box around the scan, ``dome`` for even light, ``none`` for darkness; ``auto`` for a room where the scan
+            looks like that of one, else a dome.
         seed: Of every random choice.
     """
 
@@ -41,7 +46,13 @@ class ReconstructOptions:
     probe: str | None = None
     estimate_light: bool = False
     light: bool = True
+    unseen: str = "auto"
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value, choices in (("albedo", self.albedo, ALBEDOS), ("unseen", self.unseen, UNSEEN)):
+            if value not in choices:
+                raise OptionError(f"{name} is '{value}'; choose one of {', '.join(choices)}")
 
 
 @dataclass(frozen=True)
@@ -57,6 +68,7 @@ class _Lit:
     lights: tuple[Light, ...]
     authored: SceneLights
     notes: tuple[str, ...]
+    enclosure: Enclosure | None = None
 
 
 def reconstruct(
@@ -90,7 +102,7 @@ def reconstruct(
         skipped=skipped,
     )
     notes: tuple[str, ...] = ()
-    authored = None
+    authored, enclosure = None, None
     if options.light and mesh.colors is None and options.probe is not None:
         authored, notes = SceneLights(file=options.probe), ("no photographs: the surface is grey",)
     elif options.light and mesh.colors is None:
@@ -98,25 +110,29 @@ def reconstruct(
     elif options.light:
         launcher = Launcher(device, threads)
         report("light", FUSION_SHARE)
-        lit = _find_light(launcher, capture, mesh, options)
-        authored, notes = lit.authored, lit.notes
+        eyes = [pose[:3, 3] for pose in (poses or map(capture.pose, capture)) if pose is not None]
+        lit = _find_light(launcher, capture, mesh, np.array(eyes), options)
+        authored, notes, enclosure = lit.authored, lit.notes, lit.enclosure
         if options.albedo == "irradiance" and lit.lights:
-            mesh, more = _with_albedo(launcher, mesh, lit.lights, options, threads, report)
+            mesh, more = _with_albedo(launcher, mesh, lit, options, threads, report)
             notes = (*notes, *more)
     write_scene(
         output,
         capture,
         mesh,
         lights=authored,
+        enclosure=enclosure,
         poses=poses,
         facts={"voxel": options.fusion.voxel, "albedo": options.albedo if authored else "color"},
     )
     return Reconstruction(mesh, notes)
 
 
-def _find_light(launcher: Launcher, capture: Capture, mesh: FusedMesh, options: ReconstructOptions) -> _Lit:
+def _find_light(
+    launcher: Launcher, capture: Capture, mesh: FusedMesh, eyes: np.ndarray, options: ReconstructOptions
+) -> _Lit:
     """The probe's, else the capture's own, else an estimate; and, where no dome is known, what was not seen."""
-    from warp_dvct.capture.light_fit import fit_fill, fit_light
+    from warp_dvct.capture.light_fit import fit_light
     from warp_dvct.usd.read import read_stage
 
     voxel = options.fusion.voxel
@@ -143,19 +159,33 @@ def _find_light(launcher: Launcher, capture: Capture, mesh: FusedMesh, options: 
             "residual": fit.residual,
         }
         return _Lit(fit.lights(), SceneLights(estimated=fit.probe(), facts=facts), fit.describe())
-    if any(light.kind == LightKind.DOME for light in known):
-        return _Lit(known, SceneLights(file=options.probe), ())
+    return _with_unseen(launcher, mesh, known, eyes, options)
+
+
+def _with_unseen(
+    launcher: Launcher, mesh: FusedMesh, known: tuple[Light, ...], eyes: np.ndarray, options: ReconstructOptions
+) -> _Lit:
+    """Known lights, and what stands for the parts that no frame has seen."""
+    from warp_dvct.capture.light_fit import fit_fill
+
+    voxel, file = options.fusion.voxel, options.probe
+    if options.unseen == "none" or any(light.kind == LightKind.DOME for light in known):
+        return _Lit(known, SceneLights(file=file), ())
+    if options.unseen != "dome":
+        enclosure = find_enclosure(mesh, eyes, known, voxel=voxel, asked=options.unseen == "room")
+        if enclosure is not None:
+            return _Lit(known, SceneLights(file=file), (enclosure.describe(),), enclosure)
     fill = fit_fill(launcher, mesh, known, voxel=voxel, seed=options.seed)
     level = " ".join(f"{c:.3g}" for c in fill)
     dome = Light(LightKind.DOME, (float(fill[0]), float(fill[1]), float(fill[2])), path="/Lights/Unseen")
     note = f"what no frame has seen is taken to have the radiance {level} (Lights/Unseen)"
-    return _Lit((*known, dome), SceneLights(file=options.probe, fill=fill), (note,))
+    return _Lit((*known, dome), SceneLights(file=file, fill=fill), (note,))
 
 
 def _with_albedo(
     launcher: Launcher,
     mesh: FusedMesh,
-    lights: tuple[Light, ...],
+    lit: _Lit,
     options: ReconstructOptions,
     threads: int | None,
     report: Callable[[str, float], None],
@@ -165,8 +195,9 @@ def _with_albedo(
     albedo = estimate_albedo(
         launcher,
         mesh,
-        lights,
+        lit.lights,
         voxel=options.fusion.voxel,
+        enclosure=lit.enclosure,
         threads=threads,
         progress=lambda name, share: report(name, FUSION_SHARE + (1.0 - FUSION_SHARE) * (0.3 + 0.7 * share)),
     )

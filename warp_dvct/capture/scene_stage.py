@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warp_dvct.capture.enclosure import Enclosure
 from warp_dvct.capture.fusion import FusedMesh
 from warp_dvct.capture.intrinsics import FLIP
 from warp_dvct.capture.overlay import overlay, relative, save
@@ -20,7 +21,7 @@ from warp_dvct.probe import ProbeLights, lights_usda
 from warp_dvct.usd.stage import open_stage, quiet_diagnostics, world_frame
 
 if TYPE_CHECKING:
-    from pxr import Usd
+    from pxr import Usd, UsdShade
 
 GREY = (0.18, 0.18, 0.18)  # of a mesh that no frame has colour for; UsdPreviewSurface's own fallback
 
@@ -47,6 +48,11 @@ def mesh_file(target: Path) -> Path:
     return target.with_name(f"{target.stem}_mesh.usdc")
 
 
+def unseen_file(target: Path) -> Path:
+    """The payload of what stands for the parts that no frame has seen."""
+    return target.with_name(f"{target.stem}_unseen.usdc")
+
+
 def lights_file(target: Path) -> Path:
     """The layer of estimated lights beside a scene."""
     return target.with_name(f"{target.stem}_lights.usda")
@@ -58,6 +64,7 @@ def write_scene(
     mesh: FusedMesh,
     *,
     lights: SceneLights | None = None,
+    enclosure: Enclosure | None = None,
     poses: Sequence[np.ndarray | None] | None = None,
     facts: dict[str, Any] | None = None,
 ) -> None:
@@ -69,6 +76,7 @@ def write_scene(
         path: ``.usda`` or ``.usdc``, another file than the capture.
         mesh: In the capture stage's world.
         lights: The real scene's lights, beside those that the capture has.
+        enclosure: Stands for what no frame has seen; its albedo follows the mesh's.
         poses: Depth camera (OpenCV axes) to the stage's world of every frame, where tracking found others than the
             capture's; None for a lost frame.
         facts: Kept as ``customData`` of the mesh, as what it was made with.
@@ -82,74 +90,98 @@ def write_scene(
     if root == "/":
         raise StageError(f"{capture.depth_path} of '{capture.path}' has no prim above it; put it below an Xform")
     with quiet_diagnostics():
-        _write_mesh(mesh_file(target), mesh, np.linalg.inv(capture.world))
+        to_local = np.linalg.inv(capture.world)
+        _write_mesh(mesh_file(target), "mesh", mesh.points, mesh.normals, mesh.triangles, mesh.colors, to_local)
+        if enclosure is not None and mesh.colors is not None:
+            box = enclosure.points, enclosure.normals, enclosure.triangles, enclosure.albedo(mesh.colors)
+            _write_mesh(unseen_file(target), "unseen", *box, to_local)
     if lights is not None and lights.estimated is not None:
         texture = lights_file(target).with_suffix(".exr")
         write_radiance(texture, lights.estimated.dome)
         write_text(lights_file(target), lights_usda(lights.estimated, texture.name, os.path.basename(capture.path)))
     with overlay(capture.path, target) as stage:
-        _author_mesh(stage, root, mesh_file(target).name, mesh, facts or {})
+        prim = _author_mesh(stage, root, "mesh", mesh_file(target).name)
+        prim.SetCustomDataByKey(
+            "dvct:reconstruction", {"frames": mesh.frames, "skipped": len(mesh.skipped), **(facts or {})}
+        )
+        if enclosure is not None and mesh.colors is not None:
+            unseen = _author_mesh(stage, root, "unseen", unseen_file(target).name)
+            unseen.SetDocumentation("Stands for the parts of the room that no frame has seen.")
         if poses is not None:
             _author_poses(stage, capture, poses)
         if lights is not None:
             _author_lights(stage, root, target, lights, np.linalg.inv(capture.world))
 
 
-def _write_mesh(file: Path, mesh: FusedMesh, to_local: np.ndarray) -> None:
-    """The payload: one Mesh in the space of the prim above it."""
+def _write_mesh(
+    file: Path,
+    name: str,
+    points: np.ndarray,
+    normals: np.ndarray,
+    triangles: np.ndarray,
+    colors: np.ndarray | None,
+    to_local: np.ndarray,
+) -> None:
+    """A payload: one Mesh in the space of the prim above it."""
     from pxr import Usd, UsdGeom, Vt
 
     turn = to_local[:3, :3]
-    points = np.ascontiguousarray(mesh.points @ turn.T + to_local[:3, 3], np.float32)
-    normals = mesh.normals @ turn.T
+    points = np.ascontiguousarray(points @ turn.T + to_local[:3, 3], np.float32)
+    normals = normals @ turn.T
     normals = np.ascontiguousarray(normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12))
     with replacing(file) as temporary:
         stage = Usd.Stage.CreateNew(str(temporary))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        prim = UsdGeom.Mesh.Define(stage, "/mesh")
+        prim = UsdGeom.Mesh.Define(stage, f"/{name}")
         stage.SetDefaultPrim(prim.GetPrim())
         prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-        prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.triangles), 3, np.int32)))
-        prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(mesh.triangles.ravel(), np.int32)))
+        prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, np.int32)))
+        prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles.ravel(), np.int32)))
         prim.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
         prim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
         prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         prim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(0), points.max(0)])))
-        if mesh.colors is None:
+        if colors is None:
             prim.CreateDisplayColorAttr([GREY])
         else:
-            colors = np.ascontiguousarray(np.clip(mesh.colors, 0.0, 1.0), np.float32)
-            prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(colors))
+            stored = np.ascontiguousarray(np.clip(colors, 0.0, 1.0), np.float32)
+            prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(stored))
         save(stage.GetRootLayer(), file)
         del stage
 
 
-def _author_mesh(stage: Usd.Stage, root: str, payload: str, mesh: FusedMesh, facts: dict[str, Any]) -> None:
-    """The mesh prim, tagged real, with a Lambert material of its displayColor."""
+def _author_mesh(stage: Usd.Stage, root: str, name: str, payload: str) -> Usd.Prim:
+    """A mesh prim below ``root``, tagged real, with a Lambert material of its displayColor."""
     from pxr import Sdf, UsdGeom, UsdShade
 
     _ignore_points(stage, root)
-    prim = UsdGeom.Mesh.Define(stage, f"{root}/mesh").GetPrim()
+    prim = UsdGeom.Mesh.Define(stage, f"{root}/{name}").GetPrim()
     prim.GetPayloads().AddPayload(f"./{payload}")
     tag = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("dvct:reality", Sdf.ValueTypeNames.Token)
     tag.Set("real")
-    prim.SetCustomDataByKey("dvct:reconstruction", {"frames": mesh.frames, "skipped": len(mesh.skipped), **facts})
-    UsdGeom.Scope.Define(stage, f"{root}/Materials")
-    material = UsdShade.Material.Define(stage, f"{root}/Materials/Fused")
-    reader = UsdShade.Shader.Define(stage, f"{root}/Materials/Fused/Color")
+    UsdShade.MaterialBindingAPI.Apply(prim).Bind(_lambert(stage, f"{root}/Materials"))
+    return prim
+
+
+def _lambert(stage: Usd.Stage, scope: str) -> UsdShade.Material:
+    """The material of what was scanned: the specular workflow with F0 = 0, as a capture does not say what is glossy."""
+    from pxr import Sdf, UsdGeom, UsdShade
+
+    UsdGeom.Scope.Define(stage, scope)
+    material = UsdShade.Material.Define(stage, f"{scope}/Fused")
+    reader = UsdShade.Shader.Define(stage, f"{scope}/Fused/Color")
     reader.CreateIdAttr("UsdPrimvarReader_float3")
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
-    surface = UsdShade.Shader.Define(stage, f"{root}/Materials/Fused/Surface")
+    surface = UsdShade.Shader.Define(stage, f"{scope}/Fused/Surface")
     surface.CreateIdAttr("UsdPreviewSurface")
     color = reader.CreateOutput("result", Sdf.ValueTypeNames.Float3)
     surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(color)
-    # The specular workflow with F0 = 0 is Lambert: a capture does not say how glossy things are.
     surface.CreateInput("useSpecularWorkflow", Sdf.ValueTypeNames.Int).Set(1)
     surface.CreateInput("specularColor", Sdf.ValueTypeNames.Color3f).Set((0.0, 0.0, 0.0))
     surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
-    UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
+    return material
 
 
 def _ignore_points(stage: Usd.Stage, root: str) -> None:

@@ -27,6 +27,7 @@ from warp_dvct.scene import Camera, Mesh, Role, Scene
 PATHS = ("auto", "stage", "orbit", "handheld")
 UNIT = 0.0002  # m: TUM's steps, too fine to add to the sensor's own
 FOCAL_DEPTH, FOCAL_COLOR = 585.0, 525.0  # Kinect v1 at 640 pixels across
+BOUNCES = 24  # a photograph holds all of them
 DISTANCE = 1.0  # m to what the camera looks at, where it looks at nothing
 
 
@@ -115,7 +116,13 @@ def simulate(
     first = paths.level(scenes[0].camera.to_world @ FLIP)
     poses = _poses(options, scenes, first, eye)
     relighter = Relighter(
-        scenes[0], width=options.width, height=options.height, quality=options.quality, device=device, threads=threads
+        scenes[0],
+        width=options.width,
+        height=options.height,
+        quality=options.quality,
+        settings={"bounces": BOUNCES},
+        device=device,
+        threads=threads,
     )
     files: list[FrameFiles] = []
     truths: list[FrameFiles] = []

@@ -66,6 +66,14 @@ SKIPPED_SHOWN = 10
     show_default=True,
     help="Photographs over the light that fell on the surface, or the camera's colour as it is.",
 )
+@click.option(
+    "--unseen",
+    type=click.Choice(["auto", "room", "dome", "none"]),
+    default="auto",
+    show_default=True,
+    help="What reflects light where no frame has seen anything and lamps are known: a box in which walls go on, even"
+    " light, or nothing. auto: a room where the scan looks like one, else a dome.",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of every random number.")
 @click.option(
     "--device", default="cpu", show_default=True, metavar="DEVICE", help="Of light and albedo: cpu or cuda:N."
@@ -92,6 +100,7 @@ def reconstruct(
     estimate_light: bool,
     no_light: bool,
     albedo: str,
+    unseen: str,
     seed: int,
     device: str,
     camera: str | None,
@@ -126,7 +135,7 @@ def reconstruct(
         close_holes=close_holes,
         triangles=triangles,
     )
-    options = ReconstructOptions(fusion, albedo, probe, estimate_light, not no_light, seed)
+    options = ReconstructOptions(fusion, albedo, probe, estimate_light, not no_light, unseen, seed)
     opened = open_capture(capture, camera=camera)
     poses, skipped = None, Skipped()
     if track or markers:
