@@ -6,7 +6,14 @@ further bounce only follows the links from patch to patch.
 
 import warp as wp
 
-from warp_dvct.kernels.bounce_field import BounceField, bounced_irradiance
+from warp_dvct.kernels.bounce_field import (
+    WALL_MARGIN,
+    BounceField,
+    bounced_irradiance,
+    is_parted,
+    record_of,
+    wall_side,
+)
 from warp_dvct.kernels.gather import World, radiosity_at
 from warp_dvct.kernels.geometry import FAR, Geometry, Hit, corner_position, trace_real, trace_synthetic
 from warp_dvct.kernels.materials import Materials, Surface, hemispherical_albedo, spawn_point, surface_at
@@ -14,6 +21,9 @@ from warp_dvct.kernels.sampling import PI, cosine_hemisphere, from_frame, sobol2
 from warp_dvct.kernels.volume import Volume, brick_extent, face_of, face_weight, find_record, key_cell
 
 wp.set_module_options({"enable_backward": False})
+
+WALL_AREA = wp.constant(0.25)  # share of its voxel's face that a side of a thin wall covers
+OPPOSITE = wp.constant(-0.9)  # cosine between the normals of a wall's two sides
 
 
 @wp.func
@@ -99,6 +109,7 @@ class Patches:
     albedo: wp.array(dtype=wp.vec3)
     reach: wp.array(dtype=wp.float32)
     real: wp.array(dtype=wp.int32)
+    area: wp.array(dtype=wp.float32)  # of all that shows on the face, over that of the face
     place: wp.array(dtype=wp.int64)  # key of the voxel * 6 + face: ascending, and the same whatever else is there
 
 
@@ -128,6 +139,7 @@ def _choose_patches(
     entries: int,
     runs: int,
     area_in: wp.array(dtype=wp.vec2),
+    faces: float,
     record_start_in: wp.array(dtype=wp.int32),
     order_in: wp.array(dtype=wp.int32),
     triangle_in: wp.array(dtype=wp.int32),
@@ -137,18 +149,21 @@ def _choose_patches(
     patches_out: Patches,
     table_out: wp.array(dtype=wp.int32),
 ):
-    """The largest fragment behind each occupied face becomes its patch."""
+    """The largest fragment behind each occupied face becomes its patch; a face covers ``faces`` of level 0."""
     i = first + wp.tid()
     end = entries
     if i + 1 < runs:
         end = start_in[i + 1]
     best = int(-1)
     most = float(-1.0)
+    shown = float(0.0)
     for j in range(start_in[i], end):
         area = area_in[face_order_in[j]][1]
+        shown += area
         if area > most:
             most = area
             best = face_order_in[j]
+    patches_out.area[i] = shown / faces
     face = best % 6
     record = best / 6
     stop = fragments
@@ -159,11 +174,11 @@ def _choose_patches(
     for j in range(record_start_in[record], stop):
         fragment = order_in[j]
         normal = normal_in[triangle_in[fragment]]
-        shown = face_weight(normal, face)
+        facing = face_weight(normal, face)
         if geo.double_sided[triangle_in[fragment]] != 0:
-            shown = wp.max(shown, face_weight(-normal, face))
-        if shown * fragment_in[fragment][3] > most:
-            most = shown * fragment_in[fragment][3]
+            facing = wp.max(facing, face_weight(-normal, face))
+        if facing * fragment_in[fragment][3] > most:
+            most = facing * fragment_in[fragment][3]
             chosen = fragment
     triangle = triangle_in[chosen]
     normal = normal_in[triangle]
@@ -180,23 +195,89 @@ def _choose_patches(
 
 
 @wp.func
-def patch_at(
-    volume: Volume, level: int, level_first: int, table: wp.array(dtype=wp.int32), position: wp.vec3, normal: wp.vec3
-) -> int:
-    """The patch of a surface point: behind the face that its normal shows on most, then on less; -1 for none."""
-    size = volume.voxel * float(1 << level)
-    local = (position - volume.low) / size
-    record = find_record(volume, level, int(wp.floor(local[0])), int(wp.floor(local[1])), int(wp.floor(local[2])))
-    if record < 0:
-        return -1
+def backs(patches: Patches, table: wp.array(dtype=wp.int32), front: int, place: int) -> bool:
+    """Whether the patch at ``place`` of the table is the other side of the wall that ``front`` belongs to."""
+    back = table[place]
+    if back < 0 or patches.area[back] < WALL_AREA:
+        return False
+    behind = wp.dot(patches.position[back] - patches.position[front], patches.normal[front]) <= 0.0
+    return behind and wp.dot(patches.normal[back], patches.normal[front]) < OPPOSITE
+
+
+@wp.kernel
+def _find_walls(
+    first: int,
+    volume: Volume,
+    level: int,
+    level_first: int,
+    level_key_in: wp.array(dtype=wp.int32),
+    patches: Patches,
+    table_in: wp.array(dtype=wp.int32),
+    wall_out: wp.array(dtype=wp.vec4),
+    found_out: wp.array(dtype=wp.int32),
+):
+    """The plane of a wall thinner than a voxel or two: a face whose opposite, in its voxel or the next one behind,
+    shows a surface that looks the other way. 0 where there is none."""
+    i = first + wp.tid()
+    cell = key_cell(level_key_in[i], brick_extent(volume.n, level))
+    wall_out[i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    found_out[i] = 0
+    most = float(WALL_AREA)
+    for face in range(6):
+        front = table_in[6 * i + face]
+        if front >= 0 and patches.area[front] >= most:
+            opposite = face ^ 1
+            step = wp.vec3i(0, 0, 0)
+            step[face / 2] = wp.where((face & 1) == 0, -1, 1)
+            next = find_record(volume, level, cell[0] + step[0], cell[1] + step[1], cell[2] + step[2]) - level_first
+            offset = wp.dot(patches.normal[front], patches.position[front])
+            found = False
+            if backs(patches, table_in, front, 6 * i + opposite):
+                # Both sides are in this voxel: the middle is between them.
+                back = table_in[6 * i + opposite]
+                offset = 0.5 * (offset + wp.dot(patches.normal[front], patches.position[back]))
+                found = True
+            elif next >= 0:
+                found = backs(patches, table_in, front, 6 * next + opposite)
+            if found:
+                most = patches.area[front]
+                n = patches.normal[front]
+                wall_out[i] = wp.vec4(n[0], n[1], n[2], offset)
+                found_out[i] = 1
+
+
+@wp.func
+def patch_behind(field: BounceField, record: int, normal: wp.vec3) -> int:
+    """The patch behind the face that a normal shows on most, then on less; -1 for none."""
     best = int(-1)
     most = float(0.0)
     for axis in range(3):
         share = wp.abs(normal[axis])
-        patch = table[(record - level_first) * 6 + face_of(axis, normal[axis])]
+        patch = field.table[(record - field.level_first) * 6 + face_of(axis, normal[axis])]
         if patch >= 0 and share > most:
             most = share
             best = patch
+    return best
+
+
+@wp.func
+def patch_at(field: BounceField, position: wp.vec3, normal: wp.vec3) -> int:
+    """The patch of a surface point; where a thin wall parts it from its voxel's, that of the next voxel on its side."""
+    record = record_of(field, position)
+    if record < 0:
+        return -1
+    best = patch_behind(field, record, normal)
+    if best >= 0 and field.has_walls != 0:
+        wall = field.walls[record - field.level_first]
+        size = field.volume.voxel * float(1 << field.level)
+        point = position + normal * (WALL_MARGIN * size)
+        if is_parted(wall, point, field.position[best]):
+            away = wp.vec3(wall[0], wall[1], wall[2]) * (wp.sign(wall_side(wall, point)) * size)
+            record = record_of(field, position + away)
+            if record >= 0:
+                other = patch_behind(field, record, normal)
+                if other >= 0 and not is_parted(wall, point, field.position[other]):
+                    best = other
     return best
 
 
@@ -228,10 +309,7 @@ def _link_patches(
     geo: Geometry,
     world: World,
     patches: Patches,
-    volume: Volume,
-    level: int,
-    level_first: int,
-    table_in: wp.array(dtype=wp.int32),
+    field: BounceField,
     last: PatchHits,
     rays: int,
     seed: int,
@@ -274,7 +352,7 @@ def _link_patches(
             position = origin + direction * real.t
             light = radiosity_at(world, position, n, width * real.t)
             before += light.before
-            link[0] = patch_at(volume, level, level_first, table_in, position, n)
+            link[0] = patch_at(field, position, n)
             if synthetic.found == 0:
                 after += light.after
                 link[1] = link[0]
@@ -284,7 +362,7 @@ def _link_patches(
             position = origin + direction * synthetic.t
             light = radiosity_at(world, position, n, width * synthetic.t)
             after += light.after
-            link[1] = patch_at(volume, level, level_first, table_in, position, n)
+            link[1] = patch_at(field, position, n)
         link_out[i * rays + k] = link
     irradiance_out[2 * i] = before / float(rays)
     irradiance_out[2 * i + 1] = after / float(rays)

@@ -27,6 +27,7 @@ class Patches:
         voxels: The volume they were taken from. level, level_first: Its level, and that level's first record.
         data: ``kernels.Patches``. count: How many.
         table: int ``[records of the level * 6]``, patch of a face or -1.
+        walls: vec4 ``[records of the level]``, planes of thin walls or 0. has_walls: Whether there are any.
     """
 
     voxels: Voxels
@@ -35,6 +36,8 @@ class Patches:
     data: Any
     count: int
     table: Any
+    walls: Any
+    has_walls: bool
 
 
 def mean_albedo(launcher: Launcher, scene: DeviceScene, voxels: Voxels, normals: Any) -> Any:
@@ -81,7 +84,7 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
     count = keys.shape[0]
     data = kernels.Patches()
     data.position, data.normal, data.albedo = (launcher.zeros(max(1, count), wp.vec3) for _ in range(3))
-    data.reach = launcher.zeros(max(1, count), wp.float32)
+    data.reach, data.area = (launcher.zeros(max(1, count), wp.float32) for _ in range(2))
     data.real = launcher.zeros(max(1, count), wp.int32)
     data.place = launcher.zeros(max(1, count), wp.int64)
     table = launcher.full(max(1, 6 * voxels.level_records[level]), -1, wp.int32)
@@ -100,6 +103,7 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
             count_below(launcher, key, 6 * records),
             count,
             voxels.area,
+            float(4**level),
             pieces.record_start,
             pieces.order,
             pieces.triangle,
@@ -109,7 +113,15 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
         ],
         [data, table],
     )
-    return Patches(voxels, level, level_first, data, count, table)
+    walls = launcher.zeros(max(1, voxels.level_records[level]), wp.vec4)
+    found = launcher.zeros(max(1, voxels.level_records[level]), wp.int32)
+    launcher.launch(
+        kernels._find_walls,
+        voxels.level_records[level],
+        [voxels.volume, level, level_first, voxels.level_keys[level], data, table],
+        [walls, found],
+    )
+    return Patches(voxels, level, level_first, data, count, table, walls, bool(found.numpy().any()))
 
 
 def solve_bounces(
@@ -143,10 +155,7 @@ def solve_bounces(
             scene.geometry,
             world,
             patches.data,
-            patches.voxels.volume,
-            patches.level,
-            patches.level_first,
-            patches.table,
+            bounce_field(launcher, patches, last),
             kept.last(PATCH_HITS, key) or kernels.PatchHits(),
             rays,
             seed,
@@ -180,11 +189,13 @@ def bounce_field(launcher: Launcher, patches: Patches | None, total: Any = None)
     if patches is None:
         field.volume = Volume()
         field.table, field.real = launcher.zeros(1, wp.int32), launcher.zeros(1, wp.int32)
-        field.irradiance = launcher.zeros(1, wp.vec3)
+        field.position, field.irradiance = launcher.zeros(1, wp.vec3), launcher.zeros(1, wp.vec3)
+        field.walls = launcher.zeros(1, wp.vec4)
         return field
     field.volume = patches.voxels.volume
     field.level, field.level_first = patches.level, patches.level_first
     field.table, field.real, field.irradiance = patches.table, patches.data.real, total
+    field.position, field.walls, field.has_walls = patches.data.position, patches.walls, int(patches.has_walls)
     return field
 
 
