@@ -99,7 +99,7 @@ def measure(stage: str, options: CaptureOptions) -> Report:
             fuse(CaptureFrames(capture), fusion, threads=options.threads)
         _time_integration(capture, fusion, options, report)
         truth = read_stage(file)
-        probe = _lights_layer(file, Path(folder) / "lights.usda")
+        probe = lights_layer(file, Path(folder) / "lights.usda")
         target = Path(folder) / "scene.usda"
         with _timed(report, "everything, with light and albedo", len(capture)):
             made = reconstruct(
@@ -111,7 +111,8 @@ def measure(stage: str, options: CaptureOptions) -> Report:
                 threads=options.threads,
             )
         _compare_surfaces(made.mesh, truth, report)
-        _compare_pictures(capture, target, truth, options, report)
+        how = {"quality": options.quality, "device": options.device, "threads": options.threads}
+        report.flip = compare_pictures(capture, target, truth, pictures=options.pictures, **how)
     return report
 
 
@@ -176,7 +177,7 @@ def _time_integration(capture: Capture, fusion: FusionOptions, options: CaptureO
     report.milliseconds["fusion of a frame"] = (two[0] - once[0], two[1] - once[1])
 
 
-def _lights_layer(stage: Path, target: Path) -> Path:
+def lights_layer(stage: Path, target: Path) -> Path:
     """The stage's lights in a layer of their own, with the transforms above them."""
     from pxr import Sdf, Usd, UsdGeom, UsdLux
 
@@ -214,26 +215,35 @@ def _compare_surfaces(mesh: FusedMesh, truth: Scene, report: Report) -> None:
     report.floating = float(area[distance[mesh.triangles].min(-1) > FLOATING].sum())
 
 
-def _compare_pictures(capture: Capture, scene: Path, truth: Scene, options: CaptureOptions, report: Report) -> None:
-    """FLIP between composites on the reconstruction and on the truth, with the same objects and photograph."""
+def compare_pictures(
+    capture: Capture,
+    scene: Path,
+    truth: Scene,
+    *,
+    pictures: int,
+    quality: str = "balanced",
+    device: str = "cpu",
+    threads: int | None = None,
+) -> list[float]:
+    """FLIP between composites on the reconstruction and on the truth, with the same objects and photograph.
+
+    Args:
+        scene: The reconstruction. truth: The stage that was captured, with synthetic objects.
+        pictures: How many frames, evenly over the capture.
+    """
     objects = tuple(m for m in truth.meshes if m.role == Role.SYNTHETIC)
-    for index in np.linspace(0, len(capture) - 1, options.pictures + 2)[1:-1].astype(int).tolist():
+    found = []
+    for index in np.linspace(0, len(capture) - 1, pictures + 2)[1:-1].astype(int).tolist():
         scanned = read_stage(scene, time=capture.times[index], allow_empty_roles=True)
         plate = read_plate(capture.color_file(index) or "")
         shift = len(scanned.materials)
         moved = tuple(replace(m, materials=m.materials + shift) for m in objects)
         mixed = replace(scanned, meshes=scanned.meshes + moved, materials=scanned.materials + truth.materials)
-        true = replace(truth, camera=scanned.camera)
         height, width = plate.shape[:2]
-        pictures = [
-            Relighter(
-                s, width=width, height=height, quality=options.quality, device=options.device, threads=options.threads
-            )
-            .render(plate)
-            .comp
-            for s in (true, mixed)
-        ]
-        report.flip.append(flip_ldr(pictures[0], pictures[1])[0])
+        how = {"width": width, "height": height, "quality": quality, "device": device, "threads": threads}
+        true, ours = (Relighter(s, **how).render(plate).comp for s in (replace(truth, camera=scanned.camera), mixed))
+        found.append(flip_ldr(true, ours)[0])
+    return found
 
 
 def format_report(report: Report, options: CaptureOptions) -> str:
