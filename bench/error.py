@@ -29,7 +29,7 @@ from warp_dvct.usd_scenes import names, path
 if TYPE_CHECKING:
     from warp_dvct.scene import Scene
 
-LIT_STAGES = ("room_area", "room_spot", "room_glossy", "ground_dome", "bunny")
+LIT_STAGES = ("room_area", "room_spot", "room_glossy", "ground_dome", "bunny", "thin_wall")
 MANY_BOUNCES = 8
 METRICS = ("FLIP", "RMSE", "relMSE")
 AREAS = ("picture", "affected", *REGIONS)
