@@ -128,10 +128,10 @@ def format_row(row: dict[str, Any]) -> str:
         f"{row['seconds'] / row['budget']:7.2f}{predicted['cpu_seconds']:13.2f}{row['cpu_seconds']:8.2f}"
         f"{row['cpu_seconds'] / predicted['cpu_seconds']:7.2f}"
     )
-    if flip is None or predicted["error"] is None:
-        return line
-    ratio = f"{flip / predicted['error']:7.2f}" if predicted["error"] > 0 else f"{'-':>7}"
-    return f"{line}{predicted['error']:12.4f}{flip:8.4f}{ratio}"
+    if flip is not None and predicted["error"] is not None:
+        ratio = f"{flip / predicted['error']:7.2f}" if predicted["error"] > 0 else f"{'-':>7}"
+        line += f"{predicted['error']:12.4f}{flip:8.4f}{ratio}"
+    return line + ("  more would not show" if predicted.get("enough") else "")
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> str:
@@ -139,11 +139,22 @@ def summarise(rows: Sequence[dict[str, Any]]) -> str:
     kept = [r for r in rows if "refused" not in r]
     if not kept:
         return "every budget was below the floor"
-    clock = [r["seconds"] / r["budget"] for r in kept]
+    full = [r for r in kept if not r["predicted"].get("enough")]
+    clock = [r["seconds"] / r["budget"] for r in full]
     cpu = [r["cpu_seconds"] / r["predicted"]["cpu_seconds"] for r in kept]
-    lines = [
-        f"of {len(kept)} budgets, {_share(clock, 1 - NEAR, LATEST)} were kept within {NEAR:.0%} by the clock, and the"
-        f" latest took {max(clock):.2f} of its budget",
+    lines = []
+    if full:
+        lines.append(
+            f"of {len(full)} budgets, {_share(clock, 1 - NEAR, LATEST)} were kept within {NEAR:.0%} by the clock, and"
+            f" the latest took {max(clock):.2f} of its budget"
+        )
+    if len(full) < len(kept):
+        most = max(r["seconds"] / r["budget"] for r in kept if r["predicted"].get("enough"))
+        lines.append(
+            f"in {len(kept) - len(full)} more it was said that more time would not show; they took {most:.2f} of theirs"
+            " at most"
+        )
+    lines += [
         f"processor time was within {NEAR:.0%} of the prediction for {_share(cpu, 1 - NEAR, LATEST)}; from"
         f" {min(cpu):.2f} to {max(cpu):.2f} of it",
     ]

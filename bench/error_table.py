@@ -11,14 +11,26 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from warp_dvct.accuracy import (
+    CLOSED,
+    DETAIL,
+    DETAILS,
+    LADDERS_OF,
+    REFERENCE,
+    REFERENCE_OF,
+    STRIDE,
+    Accuracy,
+    class_of,
+    kind_of,
+    stride_table,
+)
 from warp_dvct.bench.error import read, stage_file
-from warp_dvct.budget import CLOSED, LADDERS, REFERENCE, Accuracy, class_of, kind_of
 from warp_dvct.errors import OptionError
 from warp_dvct.image import write_text
 from warp_dvct.launch import Launcher
@@ -32,48 +44,43 @@ def fit_table(rows: Sequence[Mapping[str, Any]]) -> tuple[Accuracy, list[tuple[s
     """The table, and for each row its name, measured and predicted FLIP.
 
     Args:
-        rows: Of ``bench tradeoff``, delta-cones, of several stages; other methods' and cones, which a budget does not
-            choose, are left aside.
+        rows: Of ``bench tradeoff``, of several stages; path tracing and cones, which a budget does not choose, are left
+            aside.
     Raises:
         OptionError: No stage has the base point, or no knob was swept.
     """
-    rows = [r for r in rows if r["method"] == "delta-cones" and not _by_cones(_settings(r))]
-    stages = list(dict.fromkeys(r["stage"] for r in rows))
+    rows = [r for r in rows if r["method"] in LADDERS_OF and not _by_cones(_settings(r))]
     launcher = Launcher("cpu")
     surveys = {}
-    for stage in stages:
+    for stage in dict.fromkeys(r["stage"] for r in rows):
         scene = read(stage_file(stage))
         surveys[stage] = survey(scene, make_settings(), launcher, scene.camera.aspect, has_plate=True)
-    widths = [r["width"] for r in rows]
-    main = max(set(widths), key=widths.count)
-    points = {(r["stage"], r["width"], _settings(r)): net_flip(r) for r in rows}
-    base = _base_points(rows, points, main)
-    if not base:
+    sweeps = {method: _Sweep.of(method, rows) for method in LADDERS_OF}
+    cones = sweeps["delta-cones"]
+    if not cones.base:
         raise OptionError("no stage has the reference point; docs/tradeoff.md says how to measure it")
-    knobs: dict[str, dict[str, list[list[float]]]] = {}
-    for knob in (ladder.knob for ladder in LADDERS):
-        classes = {stage: class_of(knob, surveys[stage]) for stage in base}
-        for kind in dict.fromkeys(classes.values()):
-            table = _excess(knob, [s for s in base if classes[s] == kind], base, points, main)
-            if len(table) > 1:
-                knobs.setdefault(kind, {})[knob] = table
+    knobs = {kind: tables for sweep in sweeps.values() for kind, tables in sweep.tables(surveys).items() if tables}
     if not any(knobs.values()):
         raise OptionError("no knob was swept; run bench tradeoff --knob gather.rays and others first")
-    coefficients = _power_law(base, surveys, points, main)
-    tables = [Accuracy({**coefficients, "overlap": float(power)}, knobs, 0.0) for power in np.arange(0.1, 1.01, 0.05)]
+    coefficients = _power_law(cones, surveys)
+    vpls = sweeps["instant-radiosity"]
+    coefficients |= _constants(vpls, surveys, coefficients["change"])
+    tables = [Accuracy({**coefficients, "overlap": float(power)}, knobs, 0.0) for power in np.arange(0.1, 1.61, 0.05)]
 
-    def compare(table: Accuracy) -> list[tuple[str, float, float]]:
+    def compare(table: Accuracy, methods: Sequence[str]) -> list[tuple[str, float, float]]:
         return [
-            (f"{s} {w} {_name(settings)}", flip, table.error(settings, surveys[s], w))
-            for (s, w, settings), flip in points.items()
-            if flip > LEAST
+            (f"{method} {s} {w} {_name(method, settings)}", flip, table.error(settings, surveys[s], w, method))
+            for method in methods
+            for (s, w, settings), flip in sweeps[method].points.items()
+            if flip > LEAST and sweeps[method].base
         ]
 
     def spread(table: Accuracy) -> float:
-        return float(np.sqrt(np.mean([math.log(m / max(p, 1e-9)) ** 2 for _, m, p in compare(table)])))
+        pairs = compare(table, ["delta-cones"])
+        return float(np.sqrt(np.mean([math.log(m / max(p, 1e-9)) ** 2 for _, m, p in pairs])))
 
     best = min(tables, key=spread)
-    return Accuracy(best.base, best.knobs, spread(best)), compare(best)
+    return Accuracy(best.base, best.knobs, spread(best)), compare(best, list(LADDERS_OF))
 
 
 def net_flip(row: Mapping[str, Any]) -> float:
@@ -82,42 +89,96 @@ def net_flip(row: Mapping[str, Any]) -> float:
 
 
 def _settings(row: Mapping[str, Any]) -> Settings:
-    return Settings(**row["resolved"])
+    """As measured; what no ladder moves and nobody gave counts as its default, which may since have changed."""
+    counted = {NAMES[name] for name in (*REFERENCE, *row.get("settings", ()))}
+    measured = row["resolved"].items()
+    return Settings(**{k: v for k, v in measured if k in counted or row["quality"] != "balanced"})
 
 
 def _by_cones(settings: Settings) -> bool:
     return settings.gather == "cones" or settings.shadows == "cone" or settings.glossy == "cones"
 
 
-def _base_points(rows: Sequence[Mapping[str, Any]], points: Mapping[Any, float], main: int) -> dict[str, float]:
-    """By stage, FLIP at the reference."""
-    found = {}
-    for row in rows:
-        flip = points.get((row["stage"], main, make_settings("balanced", REFERENCE)), 0.0)
-        if flip > LEAST:
-            found[row["stage"]] = flip
-    return found
+@dataclass(frozen=True)
+class _Sweep:
+    """What was measured of a method.
 
+    Attributes:
+        points: FLIP by stage, width and settings. base: By stage, that at the reference.
+        main: The width of most points. stages: Those that are looked at.
+    """
 
-def _excess(
-    knob: str, stages: Sequence[str], base: Mapping[str, float], points: Mapping[Any, float], main: int
-) -> list[list[float]]:
-    """``[value, excess]`` by rising value, falling (for strides rising) in it."""
-    ladder = next(x for x in LADDERS if x.knob == knob)
-    moved = {NAMES[name] for name in ladder.settings(ladder.values[0])}
-    found: dict[float, list[float]] = {}
-    for (stage, width, settings), flip in points.items():
-        if stage not in stages or width != main:
-            continue
-        reference = asdict(make_settings("balanced", REFERENCE))
-        if {k for k, v in asdict(settings).items() if v != reference[k]} <= moved:
-            value = float(getattr(settings, NAMES[knob]))
-            found.setdefault(value, []).append(2.0 * math.log(max(flip, LEAST) / base[stage]))
-    values = sorted(found)
-    means = np.array([math.expm1(float(np.mean(found[v]))) for v in values])
-    falling = _falling(means if knob != "gather.stride" else means[::-1])
-    falling = falling if knob != "gather.stride" else falling[::-1]
-    return [[v, round(float(e), 4)] for v, e in zip(values, falling, strict=True)]
+    method: str
+    points: Mapping[Any, float]
+    base: Mapping[str, float]
+    main: int
+    stages: Sequence[str] = ()
+
+    @classmethod
+    def of(cls, method: str, rows: Sequence[Mapping[str, Any]]) -> _Sweep:
+        """The rows of a method."""
+        own = [r for r in rows if r["method"] == method]
+        points = {(r["stage"], r["width"], _settings(r)): net_flip(r) for r in own}
+        widths = [r["width"] for r in own]
+        main = max(set(widths), key=widths.count) if widths else 0
+        reference = make_settings("balanced", REFERENCE_OF[method])
+        found = {stage: points.get((stage, main, reference), 0.0) for stage in dict.fromkeys(r["stage"] for r in own)}
+        return cls(method, points, {stage: flip for stage, flip in found.items() if flip > LEAST}, main)
+
+    def tables(self, surveys: Mapping[str, Survey]) -> dict[str, dict[str, list[list[float]]]]:
+        """By class of scenes and knob."""
+        knobs: dict[str, dict[str, list[list[float]]]] = {}
+        for knob in (ladder.knob for ladder in LADDERS_OF[self.method] if ladder.knob != DETAIL):
+            classes = {stage: class_of(knob, surveys[stage], self.method) for stage in self.base}
+            for kind in dict.fromkeys(classes.values()):
+                sweep = replace(self, stages=[s for s in self.base if classes[s] == kind])
+                tables = sweep.by_detail() if knob == STRIDE else {knob: sweep.excess(knob)}
+                knobs.setdefault(kind, {}).update({name: table for name, table in tables.items() if len(table) > 1})
+        return knobs
+
+    def excess(self, knob: str) -> list[list[float]]:
+        """``[value, excess]`` by rising value, falling from cheap to dear."""
+        ladder = next(x for x in LADDERS_OF[self.method] if x.knob == knob)
+        found = self._found(knob, {NAMES[name] for name in ladder.settings(ladder.values[0])}, None)
+        order = -1 if ladder.values[0] > ladder.values[-1] else 1
+        falling = _falling(np.array(list(found.values()))[::order])[::order]
+        return [[v, round(float(e), 4)] for v, e in zip(found, falling, strict=True)]
+
+    def by_detail(self) -> dict[str, list[list[float]]]:
+        """For each detail a table of the strides, rising in them and not falling with a larger detail.
+
+        Details that were swept at few strides differ from the reference's as interpolated between these; below strides
+        of four nothing is gathered again, so that they do not differ.
+        """
+        moved = {NAMES[STRIDE], "gather_object_stride", NAMES[DETAIL]}
+        swept = {detail: self._found(STRIDE, moved, detail) for detail in DETAILS}
+        full = swept[REFERENCE[DETAIL]]
+        tables: dict[str, list[list[float]]] = {}
+        last = None
+        for detail, found in swept.items():
+            if not found or len(full) < 2:
+                continue
+            known = {2.0: 0.0, **{v: found[v] - full[v] for v in found if v in full}}
+            strides = sorted(known)
+            away = np.interp(np.log2(list(full)), np.log2(strides), [known[v] for v in strides])
+            values = np.array(list(full.values())) + away
+            values = values if last is None else np.minimum(values, last)
+            last = _falling(values[::-1])[::-1]
+            tables[stride_table(detail)] = [[v, round(float(e), 4)] for v, e in zip(full, last, strict=True)]
+        return tables
+
+    def _found(self, knob: str, moved: set[str], detail: float | None) -> dict[float, float]:
+        """By rising value, the geometric mean over the stages of squared FLIP over the reference's, less one."""
+        reference = asdict(make_settings("balanced", REFERENCE_OF[self.method]))
+        found: dict[float, list[float]] = {}
+        for (stage, width, settings), flip in self.points.items():
+            other_detail = detail is not None and settings.gather_detail != detail
+            if stage not in self.stages or width != self.main or other_detail:
+                continue
+            if {k for k, v in asdict(settings).items() if v != reference[k]} <= moved:
+                value = float(getattr(settings, NAMES[knob]))
+                found.setdefault(value, []).append(2.0 * math.log(max(flip, LEAST) / self.base[stage]))
+        return {value: math.expm1(float(np.mean(found[value]))) for value in sorted(found)}
 
 
 def _falling(values: np.ndarray) -> np.ndarray:
@@ -131,10 +192,19 @@ def _falling(values: np.ndarray) -> np.ndarray:
     return np.concatenate([np.full(int(n), v) for v, n in blocks]) if blocks else values
 
 
-def _power_law(
-    base: Mapping[str, float], surveys: Mapping[str, Survey], points: Mapping[Any, float], main: int
-) -> dict[str, float]:
+def _constants(sweep: _Sweep, surveys: Mapping[str, Survey], change: float) -> dict[str, float]:
+    """Of a method of which few stages were measured: by class, what is left of log FLIP beside the change's power."""
+    found: dict[str, list[float]] = {}
+    for stage, flip in sweep.base.items():
+        size = max(surveys[stage].affected * surveys[stage].change, 1e-3)
+        left = math.log(flip) - change * math.log(size)
+        found.setdefault(class_of("", surveys[stage], sweep.method), []).append(left)
+    return {kind: float(np.mean(values)) for kind, values in found.items()}
+
+
+def _power_law(sweep: _Sweep, surveys: Mapping[str, Survey]) -> dict[str, float]:
     """Log FLIP = constants of the classes + power * log(mean change over mean picture) + power * log(width / 320)."""
+    base, points, main = sweep.base, sweep.points, sweep.main
     stages = list(base)
     columns = [[float(kind_of(surveys[s]) == k) for s in stages] for k in ("diffuse", "glossy")]
     columns.append([float(surveys[s].met <= CLOSED) for s in stages])
@@ -159,8 +229,8 @@ def _power_law(
     }
 
 
-def _name(settings: Settings) -> str:
-    reference = asdict(make_settings("balanced", REFERENCE))
+def _name(method: str, settings: Settings) -> str:
+    reference = asdict(make_settings("balanced", REFERENCE_OF[method]))
     changed = [f"{k}={v}" for k, v in asdict(settings).items() if v != reference[k]]
     return " ".join(changed) or "reference"
 

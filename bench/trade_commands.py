@@ -108,7 +108,7 @@ def tradeoff(stages: tuple[str, ...], pairs: tuple[str, ...], cache: Path | None
     "--budget", "budgets", type=float, multiple=True, default=(0.5, 1, 2, 5, 10, 20), show_default=True, help="Seconds."
 )
 @click.option("--repeats", type=int, default=1, show_default=True, help="Of which the least times count.")
-@click.option("--method", type=click.Choice(("delta-cones", "path-trace")), default="delta-cones", show_default=True)
+@click.option("--method", type=click.Choice(METHODS), default="delta-cones", show_default=True)
 @click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="A setting that is not chosen.")
 @click.option("--width", type=click.IntRange(min=16), default=320, show_default=True, help="Pixels across.")
 @click.option("--spp", "samples", type=int, default=96, show_default=True, help="Of the truth; 0 measures no error.")

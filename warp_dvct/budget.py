@@ -1,135 +1,29 @@
 """Choosing settings for a time or an error: ``warp-dvct relight --budget SECONDS`` and ``--max-error FLIP``.
 
 The time of a choice is predicted by the cost model (:mod:`warp_dvct.cost`), its error by a table of what each knob was
-measured to cost, knob by knob: squares of FLIP add up, for the knobs' errors are independent of each other in good
-approximation. Starting from the cheapest choice, the step that takes off the most squared error for its time is taken,
-again and again, until the time is used up or the error is reached.
+measured to cost (:mod:`warp_dvct.accuracy`). Starting from the cheapest choice, the step that takes off the most
+squared error for its time is taken, again and again, until the time is used up or the error is reached.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from warp_dvct.cost import CostModel, count_work
-from warp_dvct.errors import FileError, OptionError
+from warp_dvct.accuracy import FILLED, LADDERS_OF, Accuracy, Ladder, load_accuracy, matters
+from warp_dvct.cost import CostModel, Counts, count_survey, count_work
+from warp_dvct.cost_vpls import count_vpl_work
+from warp_dvct.errors import OptionError
 from warp_dvct.settings import NAMES, Settings, make_settings
 from warp_dvct.survey import Survey
 
-TABLE_FILE = Path(__file__).with_name("accuracy.json")
 AIM = 0.95  # of the budget: the model's own spread is then inside of it
 VOXELS_PER_FEATURE = 2.0  # across the smallest extent of an object, for its light not to pass through it
-# The point that the table of errors is relative to, and settings that a budget leaves alone: how many points a stride
-# that is halved here and there adds is not known beforehand.
-REFERENCE = {
-    "volume.resolution": 128,
-    "volume.coarse": 128,
-    "rsm.texels": 1024,
-    "gather.rays": 64,
-    "gather.object_rays": 64,
-    "gather.stride": 6,
-    "gather.object_stride": 3,
-    "gather.detail": 0.0,
-    "shadows.samples": 16,
-    "shadows.probes": 8,
-    "bounces": 8,
-    "patches.count": 8192,
-    "antialias": 4,
-    "glossy.rays": 8,
-}
-MOST_RAYS = 65536
-CLOSED = 0.8  # share of gathered rays that meet a surface: above it a scene counts as a closed room
-OBJECT_STRIDE = {16: 8, 12: 6, 8: 4, 6: 3, 4: 2, 2: 1, 1: 1}
-
-
-@dataclass(frozen=True)
-class Ladder:
-    """Values of one knob from cheap to dear; ``also`` gives what moves with it."""
-
-    knob: str
-    values: tuple[int, ...]
-
-    def settings(self, value: int) -> dict[str, int]:
-        """What a value sets."""
-        if self.knob == "gather.rays":
-            return {"gather.rays": value, "gather.object_rays": value}
-        if self.knob == "gather.stride":
-            return {"gather.stride": value, "gather.object_stride": OBJECT_STRIDE[value]}
-        if self.knob == "shadows.samples":
-            return {"shadows.samples": value, "shadows.probes": value if value < 8 else value // 2}
-        return {self.knob: value}
-
-
-LADDERS = (
-    Ladder("volume.resolution", (32, 64, 96, 128, 192, 256, 384, 512)),
-    Ladder("volume.coarse", (32, 64, 96, 128, 192, 256)),
-    Ladder("rsm.texels", (64, 128, 192, 256, 384, 512, 1024, 2048)),
-    Ladder("gather.rays", (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)),
-    Ladder("gather.stride", (12, 8, 6, 4, 2, 1)),
-    Ladder("shadows.samples", (1, 2, 4, 8, 16, 32, 64)),
-    Ladder("bounces", (1, 2, 4, 6, 8, 12)),
-    Ladder("patches.count", (256, 1024, 4096, 8192, 16384, 32768)),
-    Ladder("antialias", (0, 2, 4, 8, 16)),
-    Ladder("glossy.rays", (1, 2, 4, 8, 16, 32, 64, 128)),
-)
-
-
-@dataclass(frozen=True)
-class Accuracy:
-    """What was measured of errors.
-
-    Attributes:
-        base: Coefficients of the logarithm of FLIP at ``REFERENCE``, see :meth:`reference`, and ``overlap``, the
-            power by which improvements of several knobs together fall short of their product.
-        knobs: By class of scene and knob: values, and by how much squared FLIP exceeds that of ``REFERENCE``, over it.
-            Knobs of further bounces go by ``open`` and ``closed`` scenes, the others by
-            ``diffuse`` and ``glossy`` ones.
-        spread: Standard deviation of the logarithm of measured over predicted FLIP.
-    """
-
-    base: dict[str, float]
-    knobs: dict[str, dict[str, list[list[float]]]]
-    spread: float
-
-    def reference(self, survey: Survey, width: int) -> float:
-        """FLIP at ``REFERENCE``: by class, powers of the mean change of the picture and of its width."""
-        size = max(survey.affected * survey.change, 1e-3)
-        power = self.base["width"] * math.log(width / 320.0)
-        power += 0.0 if survey.met > CLOSED else self.base["open"]  # less of the light there is indirect
-        return math.exp(self.base[kind_of(survey)] + self.base["change"] * math.log(size) + power)
-
-    def error(self, settings: Settings, survey: Survey, width: int) -> float:
-        """Mean LDR-FLIP of the picture against many bounces."""
-        if not survey.changes:
-            return 0.0
-        factor, added = 1.0, 0.0
-        for ladder in LADDERS:
-            excess = self.excess(ladder.knob, getattr(settings, NAMES[ladder.knob]), survey)
-            # Independent errors add up; what improves takes a share off what the others left, and these overlap.
-            added += max(excess, 0.0)
-            factor *= 1.0 + min(excess, 0.0)
-        return self.reference(survey, width) * math.sqrt(factor ** self.base["overlap"] * (1.0 + added))
-
-    def excess(self, knob: str, value: float, survey: Survey) -> float:
-        """Of squared FLIP over that at ``REFERENCE``, where only ``knob`` is at ``value``."""
-        if not _matters(knob, survey):
-            return 0.0
-        table = self.knobs.get(class_of(knob, survey), {}).get(knob)
-        if not table:
-            return 0.0
-        values, excess = np.array(table).T
-        if knob == "gather.rays" and value > values[-1]:
-            # Noise goes as one over the rays, down to what other causes leave: here what the last two values point to.
-            limit = excess[-1] - (excess[-2] - excess[-1]) / (values[-1] / values[-2] - 1.0)
-            return float(limit + (excess[-1] - limit) * values[-1] / value)
-        return float(np.interp(math.log2(value + 1.0), np.log2(values + 1.0), excess))
+NEARLY = 0.9  # of what is aimed at: a choice that takes less has nothing more to gain
+SHOWS = 0.005  # of an error: what doubling the rays has to take off it to be worth their time
+MOST = {"gather.rays": 65536, "vpls.further": 4096}
 
 
 @dataclass(frozen=True)
@@ -141,8 +35,10 @@ class Choice:
         error: Predicted mean LDR-FLIP of the picture.
         floor: Seconds of the cheapest choice. fixed: Settings that the user gave.
         reasons: Lines for people: what was chosen, what was left out and why.
+        enough: Whether more time would buy nothing that shows, so that some of the budget is left.
     """
 
+    method: str
     settings: Settings
     seconds: float
     cpu_seconds: float
@@ -150,6 +46,7 @@ class Choice:
     floor: float
     fixed: tuple[str, ...]
     reasons: tuple[str, ...]
+    enough: bool = False
 
     def describe(self) -> str:
         """Some lines for a terminal."""
@@ -159,29 +56,19 @@ class Choice:
 
     def to_dict(self) -> dict[str, Any]:
         """For statistics."""
-        chosen = {name: getattr(self.settings, NAMES[name]) for ladder in LADDERS for name in ladder.settings(1)}
+        ladders = LADDERS_OF.get(self.method, ())
+        chosen = {name: getattr(self.settings, NAMES[name]) for ladder in ladders for name in ladder.settings(1)}
+        if self.method == "path-trace":
+            chosen = {"samples": self.settings.samples}
         return {
             "seconds": self.seconds,
             "cpu_seconds": self.cpu_seconds,
             "error": None if math.isnan(self.error) else self.error,
             "floor": self.floor,
+            "enough": self.enough,
             "chosen": chosen,
             "reasons": list(self.reasons),
         }
-
-
-@cache
-def load_accuracy() -> Accuracy:
-    """The package's table of measured errors.
-
-    Raises:
-        FileError: It is missing or broken.
-    """
-    try:
-        data = json.loads(TABLE_FILE.read_text(encoding="utf-8"))
-        return Accuracy(dict(data["base"]), dict(data["knobs"]), float(data["spread"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FileError(f"{TABLE_FILE} is no table of errors ({error}); install the package again") from error
 
 
 def choose(
@@ -194,6 +81,7 @@ def choose(
     seconds: float | None = None,
     max_error: float | None = None,
     fixed: Mapping[str, Any] | None = None,
+    method: str = "delta-cones",
 ) -> Choice:
     """The best settings that keep a time, or the cheapest that keep an error.
 
@@ -201,13 +89,13 @@ def choose(
         seconds: For one frame from scratch, without loading and compiling.
         max_error: Mean LDR-FLIP over the picture, against a truth of many bounces.
         fixed: Settings that the user gave by dotted name; they are not chosen.
+        method: ``delta-cones`` or ``instant-radiosity``.
     Raises:
         OptionError: Neither or both are given; a budget below the floor; an error that no choice reaches.
     """
     check_request(seconds, max_error)
-    return _Chooser(survey, model, load_accuracy(), width, height, threads, dict(fixed or {})).choose(
-        seconds, max_error
-    )
+    chooser = _Chooser(method, survey, model, load_accuracy(), width, height, threads, dict(fixed or {}))
+    return chooser.choose(seconds, max_error)
 
 
 def check_request(seconds: float | None, max_error: float | None) -> None:
@@ -228,6 +116,7 @@ class _Chooser:
 
     def __init__(
         self,
+        method: str,
         survey: Survey,
         model: CostModel,
         accuracy: Accuracy,
@@ -236,16 +125,16 @@ class _Chooser:
         threads: int,
         fixed: dict[str, Any],
     ) -> None:
-        self.survey, self.model, self.accuracy = survey, model, accuracy
+        self.method, self.survey, self.model, self.accuracy = method, survey, model, accuracy
         self.width, self.height, self.threads, self.fixed = width, height, threads, fixed
-        self.base = make_settings("balanced", {"gather.detail": REFERENCE["gather.detail"], **fixed})
+        self.base = make_settings("balanced", fixed)
         self.required = math.ceil(VOXELS_PER_FEATURE / survey.feature) if survey.feature > 0.0 else 0
         self.ladders = [
             self._required(x)
-            for x in LADDERS
-            if _matters(x.knob, survey) and not any(k in fixed for k in x.settings(x.values[0]))
+            for x in LADDERS_OF[method]
+            if matters(x.knob, survey) and not any(k in fixed for k in x.settings(x.values[0]))
         ]
-        self.planning = {"survey": {"frame": 1.0, "triangles": survey.triangles * 1e-6}}
+        self.planning = {"survey": count_survey(survey)}
 
     def _required(self, ladder: Ladder) -> Ladder:
         """Without voxels that are too large for the objects: no error that the table knows shows that."""
@@ -254,7 +143,7 @@ class _Chooser:
         enough = tuple(v for v in ladder.values if v >= self.required)
         return replace(ladder, values=enough or ladder.values[-1:])
 
-    def settings(self, state: Mapping[str, int]) -> Settings:
+    def settings(self, state: Mapping[str, float]) -> Settings:
         """Of a state, over what is fixed."""
         made: dict[str, Any] = {}
         for ladder in self.ladders:
@@ -263,12 +152,16 @@ class _Chooser:
 
     def seconds(self, settings: Settings) -> float:
         """Of the clock, the survey included."""
-        work = count_work(settings, self.survey, self.width, self.height) | self.planning
-        return self.model.seconds(work, self.threads)
+        return self.model.seconds(self.work(settings), self.threads)
+
+    def work(self, settings: Settings) -> dict[str, Counts]:
+        """What a frame and its planning take."""
+        count = count_work if self.method == "delta-cones" else count_vpl_work
+        return count(settings, self.survey, self.width, self.height) | self.planning
 
     def square(self, settings: Settings) -> float:
         """Predicted squared FLIP."""
-        return self.accuracy.error(settings, self.survey, self.width) ** 2
+        return self.accuracy.error(settings, self.survey, self.width, self.method) ** 2
 
     def choose(self, budget: float | None, max_error: float | None) -> Choice:
         state = {ladder.knob: ladder.values[0] for ladder in self.ladders}
@@ -283,14 +176,16 @@ class _Chooser:
         if max_error is not None and math.sqrt(self.square(self.settings(state))) > max_error:
             least = math.sqrt(self.square(self.settings(state)))
             raise OptionError(
-                f"--max-error {max_error:g} is below what delta-cones reaches here, about {least:.4f};"
+                f"--max-error {max_error:g} is below what {self.method} reaches here, about {least:.4f};"
                 " --method path-trace has no such limit"
             )
+        enough = False
         if budget is not None:
-            state, stopped = self._fill(state, aim, stopped)
-        return self._choice(state, floor, stopped)
+            state, enough = self._fill(state, aim)
+            stopped = "more would not show" if enough else "the time is used up"
+        return self._choice(state, floor, stopped, enough=enough)
 
-    def _climb(self, state: dict[str, int], aim: float, max_error: float | None) -> tuple[dict[str, int], str]:
+    def _climb(self, state: dict[str, float], aim: float, max_error: float | None) -> tuple[dict[str, float], str]:
         """Take steps while they fit; returns the state and why it ended."""
         state = dict(state)
         while True:
@@ -315,34 +210,44 @@ class _Chooser:
                 return state, "the time is used up" if full else "nothing more that the table knows would help"
             state = best
 
-    def _fill(self, state: dict[str, int], aim: float, stopped: str) -> tuple[dict[str, int], str]:
-        """What is left of the time goes into gathered rays, which never harm."""
-        if "gather.rays" not in state:
-            return state, stopped
-        low, high = state["gather.rays"], MOST_RAYS
+    def _fill(self, state: dict[str, float], aim: float) -> tuple[dict[str, float], bool]:
+        """What is left of the time goes into rays or virtual lights, which never harm, as long as twice as many take
+        more than ``SHOWS`` off the error; and whether they do not."""
+        knob = FILLED[self.method]
+        if knob not in state:
+            return state, self.seconds(self.settings(state)) < NEARLY * aim
+        low, high = int(state[knob]), MOST[knob]
+        while low < high and self.seconds(self.settings({**state, knob: min(2 * low, high)})) <= aim:
+            now, then = (math.sqrt(self.square(self.settings({**state, knob: n}))) for n in (low, min(2 * low, high)))
+            if then > (1.0 - SHOWS) * now:
+                high = low
+            else:
+                low = min(2 * low, high)
         while low < high:
             middle = (low + high + 1) // 2
-            if self.seconds(self.settings({**state, "gather.rays": middle})) <= aim:
+            if self.seconds(self.settings({**state, knob: middle})) <= aim:
                 low = middle
             else:
                 high = middle - 1
-        return {**state, "gather.rays": low}, stopped
+        state = {**state, knob: low}
+        return state, self.seconds(self.settings(state)) < NEARLY * aim
 
-    def _choice(self, state: Mapping[str, int], floor: float, stopped: str) -> Choice:
+    def _choice(self, state: Mapping[str, float], floor: float, stopped: str, *, enough: bool) -> Choice:
         settings = self.settings(state)
-        work = count_work(settings, self.survey, self.width, self.height) | self.planning
-        error = self.accuracy.error(settings, self.survey, self.width)
+        work = self.work(settings)
         return Choice(
+            self.method,
             settings,
             self.model.seconds(work, self.threads),
             self.model.cpu_seconds(work),
-            error,
+            self.accuracy.error(settings, self.survey, self.width, self.method),
             floor,
             tuple(sorted(self.fixed)),
             tuple(self._reasons(state, settings, stopped)),
+            enough,
         )
 
-    def _reasons(self, state: Mapping[str, int], settings: Settings, stopped: str) -> list[str]:
+    def _reasons(self, state: Mapping[str, float], settings: Settings, stopped: str) -> list[str]:
         survey = self.survey
         square = self.square(settings)
         lines = [
@@ -360,7 +265,7 @@ class _Chooser:
                 + (f"takes {saved:.2f} s, without it squared error {share:+.0%}" if saved > 1e-4 else "the least")
             )
         lines += [f"{name}={value}: given" for name, value in sorted(self.fixed.items())]
-        left = [knob for knob in (x.knob for x in LADDERS) if not _matters(knob, survey)]
+        left = [knob for knob in (x.knob for x in LADDERS_OF[self.method]) if not matters(knob, survey)]
         lines += [f"left out: {knob}, {_WHY[knob]}" for knob in left if knob in _WHY]
         if survey.roughness is not None:
             lines.append(
@@ -380,23 +285,3 @@ _WHY = {
     "glossy.rays": "no material has a lobe smoother than glossy.roughness",
     "shadows.samples": "there is no light but the dome, whose shadows are gathered",
 }
-
-
-def class_of(knob: str, survey: Survey) -> str:
-    """The class of scenes whose table a knob's errors are in."""
-    if knob in ("bounces", "patches.count"):
-        return "closed" if survey.met > CLOSED else "open"
-    return kind_of(survey)
-
-
-def kind_of(survey: Survey) -> str:
-    """``diffuse``, or ``glossy`` where a lobe is traced by itself."""
-    return "diffuse" if survey.roughness is None else "glossy"
-
-
-def _matters(knob: str, survey: Survey) -> bool:
-    if knob == "glossy.rays":
-        return survey.roughness is not None
-    if knob == "shadows.samples":
-        return survey.lights > 0
-    return True

@@ -10,23 +10,25 @@ from typing import Any
 import numpy as np
 
 from warp_dvct import usd_scenes
-from warp_dvct.budget import LADDERS
-from warp_dvct.cost import REST, CostModel, Sample, count_work, fit, processor
+from warp_dvct.accuracy import LADDERS_OF
+from warp_dvct.cost import REST, CostModel, Sample, count_survey, count_work, fit, processor, shipped_model
+from warp_dvct.cost_vpls import RENAMED, count_vpl_work
 from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher
 from warp_dvct.relighter import Relighter
 from warp_dvct.scene import Mesh, Scene
 from warp_dvct.settings import make_settings
-from warp_dvct.survey import survey
+from warp_dvct.survey import Survey, survey
 from warp_dvct.usd.read import read_stage
 
-STAGES = ("room_area", "room_glossy", "ground_dome", "bunny")
-WIDTHS = (128, 256, 384)
+STAGES = ("room_area", "room_glossy", "ground_dome", "thin_wall", "bunny")
+WIDTHS = (128, 256, 384, 512)
+COUNT = {"delta-cones": count_work, "instant-radiosity": count_vpl_work}
+FRAMES_EACH = {"delta-cones": 1, "instant-radiosity": 4}  # one of so many frames is of the method
 REPEATS = 2  # of which the least counts: other work on the machine only adds
 SPLITS = 2  # of the last stage's triangles, once more: what deep trees and many triangles cost
-# Values from which the design draws: cheap enough that a frame takes below a second or two.
-DEAREST = {"volume.resolution": 384, "rsm.texels": 1024, "gather.rays": 256, "gather.stride": 2, "shadows.samples": 32}
-DEAREST |= {"patches.count": 16384, "glossy.rays": 16, "antialias": 8, "volume.coarse": 192, "bounces": 8}
+MOST_SECONDS = 3.0  # of processor time a frame, by the shipped model: dearer draws are drawn again
+MOST_DRAWS = 50
 
 
 def calibrate(
@@ -54,47 +56,71 @@ def calibrate(
     for i, (name, scene) in enumerate(scenes.items()):
         for k in range(frames):
             report(name, (i * frames + k) / (len(scenes) * frames))
-            samples += _measure(name, scene, launcher, rng, plate=k % 4 != 3)
+            plate = k % 4 != 3
+            looked, found = _look(name, scene, launcher, plate=plate)
+            samples.append(looked)
+            methods = [method for method, each in FRAMES_EACH.items() if k % each == 0]
+            samples += [_measure(name, scene, found, launcher, rng, method) for method in methods]
     report("fit", 1.0)
     return fit(samples, device=device, threads=launcher.threads, machine=processor()), samples
 
 
-def _measure(name: str, scene: Scene, launcher: Launcher, rng: np.random.Generator, *, plate: bool) -> list[Sample]:
-    settings: dict[str, int] = {}
-    for ladder in LADDERS:
-        dearest = DEAREST[ladder.knob]
-        last = next(i for i, v in enumerate(ladder.values) if v == dearest or i + 1 == len(ladder.values))
-        settings |= ladder.settings(int(rng.choice(ladder.values[: last + 1])))
-    width = int(rng.choice(WIDTHS))
+def _look(name: str, scene: Scene, launcher: Launcher, *, plate: bool) -> tuple[Sample, Survey]:
+    """The survey, timed: the lesser of a few."""
+    found, times = None, []
+    for _ in range(REPEATS):
+        start, cpu_start = time.perf_counter(), time.process_time()
+        compiled, compiled_cpu = launcher.compile_seconds, launcher.compile_cpu_seconds
+        found = survey(scene, make_settings(), launcher, scene.camera.aspect, has_plate=plate)
+        wall = time.perf_counter() - start - (launcher.compile_seconds - compiled)
+        cpu = time.process_time() - cpu_start - (launcher.compile_cpu_seconds - compiled_cpu)
+        times.append((wall if launcher.device.is_cuda else cpu, wall))
+    assert found is not None
+    cpu, wall = min(times)
+    return Sample({"survey": count_survey(found)}, {"survey": cpu}, {"survey": wall}, f"{name} survey"), found
+
+
+def _measure(
+    name: str, scene: Scene, found: Survey, launcher: Launcher, rng: np.random.Generator, method: str
+) -> Sample:
+    """A frame of some size under some settings."""
+    settings, width = _draw(scene, found, rng, method)
     height = max(1, round(width / scene.camera.aspect))
-    start, cpu_start = time.perf_counter(), time.process_time()
-    compiled, compiled_cpu = launcher.compile_seconds, launcher.compile_cpu_seconds
-    found = survey(scene, make_settings("balanced", settings), launcher, scene.camera.aspect, has_plate=plate)
-    wall = time.perf_counter() - start - (launcher.compile_seconds - compiled)
-    cpu = time.process_time() - cpu_start - (launcher.compile_cpu_seconds - compiled_cpu)
-    cpu = wall if launcher.device.is_cuda else cpu
-    planning = {"survey": {"frame": 1.0, "triangles": found.triangles * 1e-6}}
+    plate = np.full((height, width, 3), 0.5, np.float32) if found.plate else None
+    size = {"width": width, "height": height, "device": launcher.device.alias, "threads": launcher.threads}
     stats = []
     for _ in range(REPEATS):
-        relighter = Relighter(
-            scene, settings=settings, width=width, height=height, device=launcher.device.alias, threads=launcher.threads
-        )
-        relighter.render(np.full((height, width, 3), 0.5, np.float32) if plate else None)
-        stats.append(_with_rest(relighter.stats, by_clock=launcher.device.is_cuda))
-    work = count_work(make_settings("balanced", settings), found, width, height)
+        relighter = Relighter(scene, method=method, settings=settings, **size)
+        relighter.render(plate)
+        stats.append(_with_rest(relighter.stats, method, by_clock=launcher.device.is_cuda))
+    work = COUNT[method](make_settings("balanced", settings), found, width, height)
     cpu_passes, wall_passes = ({n: min(f[k][n] for f in stats) for n in stats[0][k]} for k in (0, 1))
     shown = " ".join(f"{k}={v}" for k, v in settings.items())
-    label = f"{name} {width} {'' if plate else 'no plate '}{shown}"
-    looked = Sample(planning, {"survey": cpu}, {"survey": wall}, f"{name} survey")
-    return [looked, Sample(work, cpu_passes, wall_passes, label)]
+    return Sample(work, cpu_passes, wall_passes, f"{name} {width} {'' if found.plate else 'no plate '}{shown}")
 
 
-def _with_rest(stats: dict[str, Any], *, by_clock: bool) -> tuple[dict[str, float], dict[str, float]]:
+def _draw(scene: Scene, found: Survey, rng: np.random.Generator, method: str) -> tuple[dict[str, float], int]:
+    """Any value of each ladder and any size, but no frame of many seconds."""
+    shipped = shipped_model()
+    settings: dict[str, float] = {}
+    width = WIDTHS[0]
+    for _ in range(MOST_DRAWS):
+        for ladder in LADDERS_OF[method]:
+            settings |= ladder.settings(ladder.values[rng.integers(len(ladder.values))])
+        width = int(rng.choice(WIDTHS))
+        work = COUNT[method](make_settings("balanced", settings), found, width, round(width / scene.camera.aspect))
+        if shipped.cpu_seconds(work) <= MOST_SECONDS:
+            break
+    return settings, width
+
+
+def _with_rest(stats: dict[str, Any], method: str, *, by_clock: bool) -> tuple[dict[str, float], dict[str, float]]:
     """A frame's seconds by pass, of all threads and of the clock, with what is in no pass as one more.
 
     Where kernels do not run on the processor (``by_clock``) the clock's stand for both.
     """
-    cpu, wall = dict(stats["cpu_passes"]), dict(stats["passes"])
+    names: dict[str, str] = RENAMED if method == "instant-radiosity" else {}
+    cpu, wall = ({names.get(str(n), str(n)): t for n, t in stats[k].items()} for k in ("cpu_passes", "passes"))
     cpu[REST] = max(stats["cpu_seconds"] - sum(cpu.values()), 1e-6)
     wall[REST] = max(stats["render_seconds"] - sum(wall.values()), 1e-6)
     return (wall if by_clock else cpu), wall

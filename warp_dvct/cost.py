@@ -15,18 +15,19 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from warp_dvct.errors import FileError, OptionError
 from warp_dvct.image import write_text
 from warp_dvct.settings import Settings
-from warp_dvct.survey import Survey
+from warp_dvct.survey import MapNeed, Survey, VolumeNeed
 
 DEFAULT_FILE = Path(__file__).with_name("cost.json")
 REST = "rest"  # of a frame's time, what is in no pass
+SERIAL = frozenset(("frame", "maps", "lights"))  # launches and their preparation: one thread's work
 SHORT = 2e-3  # seconds: in shorter passes the clock says little of threads
+QUIET = 0.75  # quantile of measured gains: other work on the machine only lowers them
 SMALLEST = 5e-4  # seconds: relative errors of shorter passes do not matter
 
 Counts = dict[str, float]
@@ -38,92 +39,180 @@ def count_work(settings: Settings, survey: Survey, width: int, height: int) -> d
     A pass that the scene does not need has no entry.
     """
     pixels = width * height * 1e-6
-    points = pixels + settings.antialias * survey.outline * width * 1e-6
+    edges = settings.antialias * survey.outline * width * 1e-6
     before = not survey.plate
     lit = survey.changes or before
     indirect = lit and settings.bounces > 0
-    gathered = indirect or (lit and survey.dome)
     glossy = lit and survey.roughness is not None
-    deep = math.log2(2.0 + survey.triangles)  # levels that a ray descends in a tree of triangles
-    triangles = survey.triangles * 1e-6
-    records = 2e-6 * (survey.area_fine * settings.volume_resolution**2 + survey.area_coarse * settings.volume_coarse**2)
-    passes: dict[str, Counts] = {"upload": {"frame": 1, "triangles": triangles}}
+    passes = frame_work(survey, pixels, edges)
     if indirect or glossy:
-        passes["voxelize"] = {"frame": 1, "records": records, "triangles": triangles}
-        passes["light faces"] = {"frame": 1, "records": records}
-    if indirect:
-        texels = 1e-6 * sum(_texels(need, settings) for need in survey.maps)
-        passes["rsm"] = {"maps": len(survey.maps), "texels": texels, "texels deep": texels * deep}
-        passes["inject"] = {"maps": len(survey.maps), "texels": texels, "records": records}
-    if indirect and settings.bounces > 1:
-        rays = settings.patches_count * settings.patches_rays * 1e-6
-        passes["bounces"] = {
-            "frame": 1,
-            "rays": rays,
-            "rays deep": rays * deep,
-            "transfers": rays * (settings.bounces - 1),
-            "records": records,
-        }
-    passes["gbuffer"] = {"frame": 1, "pixels": pixels, "points": points, "points deep": points * deep}
+        volumes = _volumes(settings, survey, indirect)
+        passes |= volumes
+        passes[REST] |= {"records": volumes["voxelize"]["records"]}  # to free them
     if lit:
-        passes["direct"] = _direct(settings, survey, points, deep, before)
-    if gathered:
-        passes["gather"] = _gather(settings, survey, pixels, points, deep, before)
+        passes["direct"] = direct_work(settings, survey, pixels, edges)
+    if indirect or (lit and survey.dome):
+        passes["gather"] = _gather(settings, survey, width, height, edges)
     if glossy:
-        traced = survey.glossy * points * settings.glossy_rays
-        passes["specular"] = {
-            "frame": 1,
-            "rays": traced,
-            "rays deep": traced * deep,
-            "light rays": traced * survey.lights,
-            "points": survey.glossy * points,
-        }
-    passes["resolve"] = {"frame": 1, "points": points}
-    passes["composite"] = {"frame": 1, "pixels": pixels}
-    passes[REST] = {"frame": 1, "pixels": pixels, "triangles": triangles}
+        passes["specular"] = _specular(settings, survey, pixels, edges)
     return passes
 
 
-def _texels(need: Any, settings: Settings) -> float:
-    """Of a light's maps: of the fine and the coarse volume, before and after."""
-    sizes = (
-        min(max(16, math.ceil(per_voxel * n * settings.rsm_density)), settings.rsm_texels) if per_voxel * n > 0.0 else 0
-        for per_voxel, n in ((need.fine, settings.volume_resolution), (need.coarse, settings.volume_coarse))
+def frame_work(survey: Survey, pixels: float, edges: float) -> dict[str, Counts]:
+    """Counts of the passes that every method has; ``pixels`` and ``edges`` are points in millions."""
+    triangles = survey.triangles * 1e-6
+    return {
+        "upload": {"frame": 1, "triangles": triangles},
+        "gbuffer": {
+            "frame": 1,
+            "pixels": pixels,
+            "edge points": edges,
+            "rays deep": (pixels + edges) * tree_depth(survey),
+        },
+        "resolve": {"frame": 1, "points": pixels + edges},
+        "composite": {"frame": 1, "pixels": pixels},
+        REST: {"frame": 1, "pixels": pixels, "triangles": triangles},
+    }
+
+
+def count_survey(survey: Survey) -> Counts:
+    """Of the survey itself."""
+    return {"frame": 1, "triangles": survey.triangles * 1e-6, "lights": len(survey.maps)}
+
+
+def tree_depth(survey: Survey) -> float:
+    """Levels that a ray descends in the trees of real and of synthetic triangles."""
+    return math.log2(2.0 + survey.real_triangles) + math.log2(2.0 + survey.synthetic_triangles)
+
+
+def _volumes(settings: Settings, survey: Survey, indirect: bool) -> dict[str, Counts]:
+    """Voxels, light maps, and further bounces."""
+    sizes = [(survey.fine, settings.volume_resolution)]
+    if survey.coarse is not None and settings.volume_coarse > 0:
+        sizes.append((survey.coarse, settings.volume_coarse))
+    records = 1e-6 * sum(need.records_at(n) for need, n in sizes)
+    fragments = 1e-6 * sum(need.fragments_at(n) for need, n in sizes)
+    triangles = survey.triangles * 1e-6
+    passes: dict[str, Counts] = {
+        "voxelize": {"frame": 1, "records": records, "fragments": fragments, "triangles": triangles},
+        "light faces": {"frame": 1, "records": records},
+    }
+    if not indirect:
+        return passes
+    maps = float(len(survey.maps) * len(sizes))
+    texels = 1e-6 * sum(_texels(need, settings, len(sizes)) for need in survey.maps)
+    passes["rsm"] = {"maps": maps, "texels": texels, "texels deep": texels * tree_depth(survey)}
+    passes["inject"] = {"maps": maps, "texels": texels, "records": records}
+    if settings.bounces > 1:
+        rays = 1e-6 * _patches(settings, survey, *sizes[-1]) * settings.patches_rays
+        passes["bounces"] = {
+            "frame": 1,
+            "rays": rays,
+            "met": rays * survey.met,
+            "rays deep": rays * tree_depth(survey),
+            "transfers": rays * (settings.bounces - 2),
+            "faces": 1e-6 * sizes[-1][0].records_at(sizes[-1][1]),  # of the last volume, sorted into patches
+            "records": records,
+            "fragments": fragments,
+        }
+    return passes
+
+
+def _texels(need: MapNeed, settings: Settings, volumes: int) -> float:
+    """Of a light's maps, of the fine and of the coarse volume."""
+    sizes = ((need.fine, settings.volume_resolution), (need.coarse, settings.volume_coarse))
+    edges = (min(max(16, math.ceil(x * n * settings.rsm_density)), settings.rsm_texels) for x, n in sizes[:volumes])
+    return sum(float(edge) ** 2 for edge in edges)
+
+
+def _patches(settings: Settings, survey: Survey, need: VolumeNeed, n: int) -> float:
+    """Patches of the level that ``passes.bounces.choose_patches`` takes: the next one holds a quarter."""
+    records = need.records_at(n)
+    while 2.0 * records > settings.patches_count and n > 1:
+        records, n = 0.25 * records, (n + 1) // 2
+    return records * survey.patches
+
+
+def direct_work(settings: Settings, survey: Survey, pixels: float, edges: float) -> Counts:
+    """The direct pass.
+
+    Real points trace the samples that may meet an object, and most stop after the probes; objects' points trace the
+    probes and, where these disagree, the rest.
+    """
+    depth = math.log2(2.0 + survey.synthetic_triangles)
+    probes = draws(min(settings.shadows_probes, settings.shadows_samples), settings, pixels, edges)
+    samples = draws(settings.shadows_samples, settings, pixels, edges)
+    object_probes = draws(
+        min(settings.shadows_probes, settings.shadows_samples),
+        settings,
+        survey.object * pixels,
+        survey.edge.object * edges,
     )
-    return (2 if need.pair else 1) * sum(float(size) ** 2 for size in sizes)
-
-
-def _direct(settings: Settings, survey: Survey, points: float, deep: float, before: bool) -> Counts:
-    probes = min(settings.shadows_probes, settings.shadows_samples)
-    near = survey.near * points * settings.shadows_samples
-    on_objects = survey.object * points * survey.lights * settings.shadows_samples
-    everywhere = points * survey.lights * settings.shadows_samples if before else 0.0
     return {
         "frame": 1,
-        "probes": points * survey.lights * probes,
-        "near": near,
-        "object": on_objects,
-        "before": everywhere * deep,
-        "points": points,
+        "probes": probes * survey.lights,
+        "near probes deep": survey.near * probes * depth,
+        "near deep": survey.near * samples * depth,
+        "object probes deep": object_probes * survey.lights * tree_depth(survey),
+        "before deep": 0.0 if survey.plate else samples * survey.lights * tree_depth(survey),
+        "points": pixels + edges,
     }
 
 
-def _gather(settings: Settings, survey: Survey, pixels: float, points: float, deep: float, before: bool) -> Counts:
-    real = survey.real * pixels / settings.gather_stride**2 * settings.gather_rays
-    on_object = survey.object * pixels / settings.gather_object_stride**2 * settings.gather_object_rays
-    # Without a plate the real surfaces behind the objects are gathered point by point, with a quarter of the rays.
-    behind = survey.object * points * max(1, settings.gather_rays // 4) if before else 0.0
+def draws(each: int, settings: Settings, pixels: float, edges: float) -> float:
+    """Samples of all points: an edge pixel's centre draws all, and its edge points share them out."""
+    shared = math.ceil(each / settings.antialias) if settings.antialias else 0
+    return each * pixels + shared * edges
+
+
+def _specular(settings: Settings, survey: Survey, pixels: float, edges: float) -> Counts:
+    """Rays of sharp lobes end in a surface that is lit by every light; those of blurred ones in voxels."""
+    sharp = draws(settings.glossy_rays, settings, survey.sharp * pixels, survey.edge.sharp * edges)
+    blurred = draws(settings.glossy_rays, settings, survey.blurred * pixels, survey.edge.blurred * edges)
+    return {
+        "frame": 1,
+        "sharp": sharp,
+        "sharp deep": sharp * tree_depth(survey) * (1 + len(survey.maps)),
+        "blurred": blurred,
+        "blurred deep": blurred * tree_depth(survey),
+        "points": (survey.sharp + survey.blurred) * pixels + (survey.edge.sharp + survey.edge.blurred) * edges,
+    }
+
+
+def _gather(settings: Settings, survey: Survey, width: int, height: int, edges: float) -> Counts:
+    """Rays by what they cost: all descend the real tree, some the synthetic one, some read voxels; a point's first ones
+    find nothing in the processor's caches, which goes by the root of their number."""
+    counts = dict.fromkeys(("gathered", "first rays", "rays", "met", "real deep", "synthetic deep", "focused"), 0.0)
+    detail = settings.gather_detail
+
+    def add(points: float, rays: int, met: float, entered: float) -> None:
+        traced = 1e-6 * points * rays
+        counts["gathered"] += 1e-6 * points
+        counts["first rays"] += 1e-6 * points * math.sqrt(rays)
+        counts["rays"] += traced
+        counts["met"] += traced * met
+        counts["real deep"] += traced * math.log2(2.0 + survey.real_triangles)
+        counts["synthetic deep"] += traced * entered * math.log2(2.0 + survey.synthetic_triangles)
+        counts["focused"] += traced * float(survey.focuses)
+
+    real, on_object = survey.on_real, survey.on_object
+    pixels = width * height * 1e-6
+    on_edges = survey.edge.object * edges
+    first, again = real.need.points(settings.gather_stride, width, height, detail)
+    alone, at_edges = real.need.alone(settings.gather_stride, width, detail)
+    again += 1e6 * (alone * survey.real * pixels + at_edges * (edges - on_edges))
+    add(first, settings.gather_rays, real.met, real.entered)
+    add(again, settings.gather_rays, real.met, real.entered_again)
+    first, again = on_object.need.points(settings.gather_object_stride, width, height, detail)
+    alone, at_edges = on_object.need.alone(settings.gather_object_stride, width, detail)
+    again += 1e6 * (alone * survey.object * pixels + at_edges * on_edges)
+    add(first + again, settings.gather_object_rays, on_object.met, on_object.entered)
+    if not survey.plate:
+        # Real surfaces behind the objects are gathered point by point, with a quarter of the rays.
+        hidden = 1e6 * (survey.object * pixels + on_edges)
+        add(hidden, max(1, settings.gather_rays // 4), real.met, real.entered_again)
     blocks = pixels / settings.gather_stride**2 + pixels / settings.gather_object_stride**2
-    return {
-        "frame": 1,
-        "real rays": real + behind,
-        "real rays met": (real + behind) * survey.met,  # such a ray also reads voxels
-        "object rays": on_object,
-        "object rays met": on_object * survey.met,
-        "rays deep": (real + behind + on_object) * deep,
-        "points": points,
-        "blocks": blocks,
-    }
+    return {"frame": 1, "points": pixels + edges, "blocks": blocks, **counts}
 
 
 @dataclass(frozen=True)
@@ -133,7 +222,7 @@ class CostModel:
     Attributes:
         device: ``cpu`` or a CUDA device's name. threads: That were used. machine: In words.
         units: Processor seconds (of the clock on CUDA) by pass and unit.
-        speedup: By pass: how many times faster than one thread the clock says that ``threads`` were.
+        speedup: By pass, of what is not ``SERIAL``: by the clock, how much faster than one thread all were.
         spread: Standard deviation of the logarithm of measured over predicted frame times.
         shipped: Whether this is the package's own and not of this machine.
     """
@@ -156,14 +245,18 @@ class CostModel:
 
     def by_pass(self, work: Mapping[str, Counts], threads: int) -> dict[str, float]:
         """Seconds of the clock by pass."""
-        return {name: self._cost(name, counts) / self._gain(name, threads) for name, counts in work.items()}
+        found = {}
+        for name, counts in work.items():
+            alone = self._cost(name, {unit: n for unit, n in counts.items() if unit in SERIAL})
+            found[name] = alone + (self._cost(name, counts) - alone) / self._gain(name, threads)
+        return found
 
     def _cost(self, name: str, counts: Counts) -> float:
         units = self.units.get(name, {})
         return sum(units.get(unit, 0.0) * count for unit, count in counts.items())
 
     def _gain(self, name: str, threads: int) -> float:
-        """Amdahl: the part of a pass that runs on one thread follows from its measured gain."""
+        """Of what is not ``SERIAL``. Amdahl: the part that runs on one thread follows from the measured gain."""
         measured = self.speedup.get(name, 1.0)
         if self.threads < 2 or measured <= 1.0 or threads < 2:
             return 1.0
@@ -200,12 +293,20 @@ def fit(samples: Sequence[Sample], *, device: str, threads: int, machine: str) -
         seconds = np.array([max(s.cpu[name], 1e-9) for s in have])
         found = non_negative(counts / np.maximum(seconds, SMALLEST)[:, None], seconds / np.maximum(seconds, SMALLEST))
         units[name] = {key: float(value) for key, value in zip(keys, found, strict=True) if value > 0.0}
-        gains = [s.cpu[name] / s.wall[name] for s in have if s.wall[name] > SHORT]
-        # Other work on the machine only lowers it: a high quantile is nearer to what an idle machine does.
-        speedup[name] = float(np.clip(np.quantile(gains, 0.9), 1.0, threads)) if gains else 1.0
+        speedup[name] = _speedup(name, units[name], have, threads)
     model = CostModel(device, threads, machine, units, speedup, 0.0)
     ratios = [math.log(sum(s.cpu.values()) / max(model.cpu_seconds(s.work), 1e-9)) for s in samples]
     return CostModel(device, threads, machine, units, speedup, float(np.std(ratios)))
+
+
+def _speedup(name: str, units: Counts, samples: Sequence[Sample], threads: int) -> float:
+    """How much faster all threads were, of frames in which the pass is no short one."""
+    gains = []
+    for s in samples:
+        alone = sum(units.get(unit, 0.0) * n for unit, n in s.work[name].items() if unit in SERIAL)
+        if s.wall[name] - alone > SHORT:
+            gains.append((s.cpu[name] - alone) / (s.wall[name] - alone))
+    return float(np.clip(np.quantile(gains, QUIET), 1.0, threads)) if gains else 1.0
 
 
 def non_negative(matrix: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -274,10 +375,19 @@ def load_model(device: str) -> CostModel:
             raise OptionError(
                 f"what a frame costs on {device} is not known; run `warp-dvct calibrate --device {device}` once"
             ) from error
-        return _parse(DEFAULT_FILE.read_text(encoding="utf-8"), DEFAULT_FILE, shipped=True)
+        return shipped_model()
     except OSError as error:
         raise FileError(f"{file} cannot be read: {error.strerror or error}") from error
     return _parse(text, file, shipped=False)
+
+
+def shipped_model() -> CostModel:
+    """The package's own, of another machine's processor.
+
+    Raises:
+        FileError: It is broken.
+    """
+    return _parse(DEFAULT_FILE.read_text(encoding="utf-8"), DEFAULT_FILE, shipped=True)
 
 
 def save_model(model: CostModel, file: Path) -> None:

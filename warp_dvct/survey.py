@@ -1,6 +1,6 @@
 """What a picture requires of a scene, found before its settings are chosen: surfaces, pixels by kind, lights, lobes.
 
-A small picture is rendered with coarse settings (0.05 s of processor time for a room). Counts in it are shares of the
+A small picture is rendered with coarse settings (0.1 s of processor time for a room). Counts in it are shares of the
 picture, so they hold for any size; nothing in it is timed, so the same scene gives the same survey on every machine.
 """
 
@@ -13,19 +13,25 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_dvct import gather_need
 from warp_dvct.device_scene import DeviceScene
+from warp_dvct.gather_need import GatherNeed, Seen, View
 from warp_dvct.kernels import survey as kernels
+from warp_dvct.kernels.specular import BLURRED
 from warp_dvct.launch import Launcher
+from warp_dvct.layers import Layers
 from warp_dvct.methods import delta_cone_tracing
 from warp_dvct.metrics import affected_mask, smooth_delta
 from warp_dvct.passes.composite import composite
+from warp_dvct.passes.gather import glossy_hits
 from warp_dvct.passes.gbuffer import GBuffer, render_gbuffer
-from warp_dvct.plan import Plan, make_plan, surface_area
+from warp_dvct.plan import Plan, make_plan
 from warp_dvct.scene import Light, LightKind, Role, Scene
 from warp_dvct.settings import Settings, make_settings
 
 WIDTH = 80
-MET_RAYS = 4
+RAYS = 8  # of a point, to see what is around it
+FRAGMENTS_PER_RECORD = 1.15  # of triangles larger than voxels
 COARSE = {
     "bounces": 2,
     "antialias": 0,
@@ -39,8 +45,8 @@ COARSE = {
     "gather.stride": 4,
     "gather.object_stride": 2,
     "glossy.rays": 2,
-    "patches.count": 256,
-    "patches.rays": 16,
+    "patches.count": 2400,
+    "patches.rays": 4,
 }
 REFERENCE = {"volume.resolution": 256, "volume.coarse": 128, "rsm.texels": 8192}  # at which map sizes are taken
 
@@ -55,17 +61,67 @@ class MapNeed:
 
 
 @dataclass(frozen=True)
+class VolumeNeed:
+    """What a volume held when it had ``n`` voxels an edge: voxels with surface, and pieces of triangles in them."""
+
+    n: int
+    records: int
+    fragments: int
+
+    def records_at(self, n: int) -> float:
+        """Voxels that hold surface go by the square of those along an edge."""
+        return self.records * (n / self.n) ** 2
+
+    def fragments_at(self, n: int) -> float:
+        """Pieces of triangles: inside of a voxel one each; across voxels' borders by the voxels along an edge; of what
+        is larger than a voxel by the voxels' number."""
+        more = self.records_at(n) - self.records
+        small = max(self.fragments - FRAGMENTS_PER_RECORD * self.records, 0.0)
+        return max(self.fragments + FRAGMENTS_PER_RECORD * more + 0.01 * small * (n - self.n), self.records_at(n))
+
+
+@dataclass(frozen=True)
+class PointNeed:
+    """What gathers of one role take.
+
+    Attributes:
+        need: How many points.
+        met: Share of their rays that meet a surface and do not leave the scene.
+        entered, entered_again: Shares of their rays that pass the synthetic objects' box: of all points, and of those
+            that are gathered again at half the stride.
+    """
+
+    need: GatherNeed
+    met: float
+    entered: float
+    entered_again: float
+
+
+@dataclass(frozen=True)
+class EdgeNeed:
+    """Shares of the shading points at edges."""
+
+    object: float = 0.0
+    sharp: float = 0.0
+    blurred: float = 0.0
+
+
+@dataclass(frozen=True)
 class Survey:
     """What a scene asks of a frame.
 
     Attributes:
-        triangles: In all. lights: Those that the direct pass samples, all but domes. dome: Whether there is one.
+        real_triangles, synthetic_triangles: Of each role.
+        lights: Those that the direct pass samples, all but domes. dome: Whether there is one.
         maps: Per light.
-        area_fine, area_coarse: Surface in each volume, over the square of its edge; 0 for no coarse volume.
-        real, object: Shares of the pixels whose centre shows real surface, and synthetic.
+        fine, coarse: The volumes; None for no coarse one.
+        patches: Per record of the level that they are taken from.
+        on_real, on_object: What gathering at real and at synthetic surfaces takes.
+        edge: What the shading points at edges show: shares as ``object``, ``sharp`` and ``blurred``.
         met: Of rays that gather light at what is seen, the share that meets a surface and does not leave the scene.
         outline: Edge pixels of a picture, over its width.
-        glossy: Share of the pixels with a lobe that is traced by itself.
+        sharp, blurred: Shares of the pixels with a lobe that is traced by itself, whose rays' ends are lit by lights
+            or read from the voxels.
         near: Over all lights, shares of pixels whose line to the light passes the synthetic objects.
         affected: Share of the pixels that the objects cover or change by more than 0.01.
         change: Mean over affected pixels of the change's size, over the mean picture.
@@ -73,19 +129,24 @@ class Survey:
         feature: Smallest extent of a synthetic mesh, in edges of the fine volume; 0 where there is none.
         voxel: Edge of the fine volume in metres.
         roughness: Of the smoothest glossy material, None where the specular pass has nothing to do.
+        focuses: Whether what gathered rays meet may send light to places rather than all around.
     """
 
-    triangles: int
+    real_triangles: int
+    synthetic_triangles: int
     lights: int
     dome: bool
     maps: tuple[MapNeed, ...]
-    area_fine: float
-    area_coarse: float
-    real: float
-    object: float
+    fine: VolumeNeed
+    coarse: VolumeNeed | None
+    patches: float
+    on_real: PointNeed
+    on_object: PointNeed
+    edge: EdgeNeed
     met: float
     outline: float
-    glossy: float
+    sharp: float
+    blurred: float
     near: float
     affected: float
     change: float
@@ -94,6 +155,22 @@ class Survey:
     feature: float
     voxel: float
     roughness: float | None
+    focuses: bool
+
+    @property
+    def triangles(self) -> int:
+        """In all."""
+        return self.real_triangles + self.synthetic_triangles
+
+    @property
+    def real(self) -> float:
+        """Share of the pixels whose centre shows real surface."""
+        return self.on_real.need.share
+
+    @property
+    def object(self) -> float:
+        """Share of the pixels whose centre shows an object."""
+        return self.on_object.need.share
 
 
 def survey(scene: Scene, settings: Settings, launcher: Launcher, aspect: float, *, has_plate: bool) -> Survey:
@@ -112,62 +189,140 @@ def survey(scene: Scene, settings: Settings, launcher: Launcher, aspect: float, 
     needs = make_plan(scene, make_settings("balanced", {**REFERENCE, **fixed}), "delta-cones", WIDTH, height)
     plan = make_plan(scene, make_settings("balanced", {**COARSE, **fixed}), "delta-cones", WIDTH, height)
     device_scene = DeviceScene.upload(launcher, scene, np.asarray(plan.origin), plan.scale)
-    buffer = render_gbuffer(launcher, device_scene, WIDTH, height, edge_samples=1, behind=False)
-    affected, change = _pilot(scene, device_scene, launcher, plan)
-    role, lobe = (a.numpy()[: WIDTH * height] for a in (buffer.points.role, buffer.points.lobe))
-    real = role == int(Role.REAL)
-    glossy = (role >= 0) & (lobe[:, 0] > 0.0) & (lobe[:, 1] <= plan.alpha_max)
+    pilot = _pilot(scene, device_scene, launcher, plan)
+    least = settings.gather_change if has_plate else 0.0
+    seen = _look(scene, device_scene, launcher, plan, 2 * height, pilot.changed(least))
     return Survey(
-        triangles=len(device_scene.triangles_vs),
+        real_triangles=device_scene.synthetic_first,
+        synthetic_triangles=len(device_scene.triangles_vs) - device_scene.synthetic_first,
         lights=sum(x.kind != LightKind.DOME for x in scene.lights),
         dome=any(x.kind == LightKind.DOME for x in scene.lights),
         maps=tuple(
             MapNeed(m.size / needs.fine.n, m.coarse_size / needs.coarse.n if needs.coarse else 0.0, m.pair)
             for m in needs.maps
         ),
-        area_fine=_area(scene, plan, plan.fine),
-        area_coarse=_area(scene, plan, plan.coarse) if plan.coarse else 0.0,
-        real=float(real.mean()),
-        object=float((role == int(Role.SYNTHETIC)).mean()),
-        met=_met(launcher, device_scene, buffer),
-        outline=(buffer.count - WIDTH * height) / WIDTH,
-        glossy=float(glossy.mean()),
-        near=_near(scene, plan, buffer, real),
-        affected=affected,
-        change=change,
+        fine=pilot.fine,
+        coarse=pilot.coarse,
+        patches=pilot.patches,
+        **seen,
+        affected=pilot.affected,
+        change=pilot.change,
         changes=plan.changes,
         plate=has_plate,
         feature=_feature(scene) * plan.scale,
         voxel=1.0 / plan.scale,
         roughness=_smoothest(scene) if plan.glossy else None,
+        focuses=pilot.focuses,
     )
 
 
-def _met(launcher: Launcher, device_scene: DeviceScene, buffer: GBuffer) -> float:
-    count = WIDTH * buffer.height
-    found = launcher.empty(count, wp.int32)
-    launcher.launch(kernels._count_met, count, [buffer.points, device_scene.geometry, MET_RAYS, 0], [found])
-    met = found.numpy()
-    return float(met[met >= 0].mean()) / MET_RAYS if (met >= 0).any() else 0.0
+@dataclass(frozen=True)
+class _Pilot:
+    """The coarse picture and its volumes; see :class:`Survey`. ``layers`` is None where nothing changes."""
+
+    fine: VolumeNeed
+    coarse: VolumeNeed | None
+    patches: float
+    layers: Layers | None
+    affected: float
+    change: float
+    shape: tuple[int, int]
+    focuses: bool
+
+    def changed(self, least: float) -> np.ndarray:
+        """Pixels whose light changes by more than a share ``least`` of it, bool ``[h, w]``."""
+        if self.layers is None or least <= 0.0:
+            return np.ones(self.shape, bool)
+        # Fewer rays see a small change in fewer places: half of it counts.
+        size = np.abs(self.layers.delta).max(-1) >= 0.5 * least * self.layers.plate.max(-1)
+        return size | (self.layers.mask_synthetic > 0.0)
 
 
-def _area(scene: Scene, plan: Plan, box: Any) -> float:
-    return surface_area(scene, box, plan.scale, np.asarray(plan.origin)) / box.edge**2
-
-
-def _pilot(scene: Scene, device_scene: DeviceScene, launcher: Launcher, plan: Plan) -> tuple[float, float]:
-    """Share of affected pixels, and the mean size of their change over the mean picture, from the coarse picture."""
-    if not plan.changes:
-        return 0.0, 0.0
+def _pilot(scene: Scene, device_scene: DeviceScene, launcher: Launcher, plan: Plan) -> _Pilot:
+    """Volumes of few voxels, and a picture that says how much the objects change."""
     lit = delta_cone_tracing.light_volumes(launcher, scene, device_scene, plan)
-    radiance = delta_cone_tracing.render(launcher, scene, device_scene, lit, plan, with_before=True)
-    layers = composite(launcher, radiance, None)
-    delta = smooth_delta(layers.delta, layers.mask_synthetic)
-    mask = affected_mask(delta, layers.mask_synthetic)
-    level = float(np.abs(layers.comp).mean())
-    if not mask.any() or level <= 0.0:
-        return 0.0, 0.0
-    return float(mask.mean()), float(np.abs(layers.comp - layers.plate)[mask].mean()) / level
+    needs = [VolumeNeed(v.box.n, v.level_records[0], v.fragments.count) for v in lit.volumes]
+    fine = needs[0] if needs else VolumeNeed(plan.fine.n, 0, 0)
+    patches = 0.0
+    if lit.bounces.present:
+        records = lit.volumes[-1].level_records[lit.bounces.level]
+        patches = lit.bounces.real.shape[0] / max(records, 1)
+    focusing = glossy_hits(launcher, scene, device_scene, lit.bounces, 0) is not None
+    layers, affected, change = None, 0.0, 0.0
+    if plan.changes:
+        radiance = delta_cone_tracing.render(launcher, scene, device_scene, lit, plan, with_before=True)
+        layers = composite(launcher, radiance, None)
+        mask = affected_mask(smooth_delta(layers.delta, layers.mask_synthetic), layers.mask_synthetic)
+        level = float(np.abs(layers.comp).mean())
+        if mask.any() and level > 0.0:
+            affected = float(mask.mean())
+            change = float(np.abs(layers.comp - layers.plate)[mask].mean()) / level
+    coarse = needs[1] if len(needs) > 1 else None
+    return _Pilot(fine, coarse, patches, layers, affected, change, (plan.height, plan.width), focusing)
+
+
+def _look(
+    scene: Scene, device_scene: DeviceScene, launcher: Launcher, plan: Plan, height: int, changed: np.ndarray
+) -> dict[str, Any]:
+    """What the camera sees, in a picture of twice the pilot's size, and what is seen from there."""
+    width = gather_need.WIDTH
+    buffer = render_gbuffer(launcher, device_scene, width, height, edge_samples=1, behind=False)
+    points, pixels = buffer.points, width * height
+    role, lobe = points.role.numpy(), points.lobe.numpy()
+    lobed = (role >= 0) & (lobe[:, 0] > 0.0) & (lobe[:, 1] <= plan.alpha_max)
+    sharp = lobed & (lobe[:, 1] < float(BLURRED))
+    kinds = {"object": role == int(Role.SYNTHETIC), "sharp": sharp, "blurred": lobed & ~sharp}
+    met, entered, nearness = _around(scene, device_scene, launcher, plan, buffer)
+    arrays = (points.pixel, points.position, points.normal, points.normal_g, points.footprint)
+    shown = Seen(role, *(a.numpy() for a in arrays))
+    changed = changed.repeat(2, 0).repeat(2, 1)
+    needs = {}
+    for name, which in (("on_real", Role.REAL), ("on_object", Role.SYNTHETIC)):
+        mask = (role[:pixels] == int(which)).reshape(height, width)
+        # Only real surfaces are left alone where nothing changes.
+        live = changed if which == Role.REAL else np.ones_like(mask)
+        need, again = gather_need.gather_need(View(shown, int(which), nearness, live))
+        needs[name] = PointNeed(need, _mean(met, mask), _mean(entered, mask), _mean(entered, again))
+    edges = EdgeNeed()
+    if buffer.count > pixels:
+        edges = EdgeNeed(**{name: float(kind[pixels : buffer.count].mean()) for name, kind in kinds.items()})
+    return {
+        **needs,
+        "edge": edges,
+        "met": _mean(met, role[:pixels].reshape(height, width) >= 0),
+        "outline": (buffer.count - pixels) / width,
+        "sharp": float(sharp[:pixels].mean()),
+        "blurred": float(kinds["blurred"][:pixels].mean()),
+        "near": _near(scene, plan, buffer, role[:pixels] == int(Role.REAL)),
+    }
+
+
+def _mean(values: np.ndarray, mask: np.ndarray) -> float:
+    counted = mask & ~np.isnan(values)
+    return float(values[counted].mean()) if counted.any() else 0.0
+
+
+def _around(
+    scene: Scene, device_scene: DeviceScene, launcher: Launcher, plan: Plan, buffer: GBuffer
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """By pixel, from every other one each way: shares of its rays that meet a surface and that pass the synthetic box
+    (NaN where there is no surface), and the mean inverse distance of what they meet."""
+    shape = -(-buffer.height // 2), -(-buffer.width // 2)
+    rows, columns = np.meshgrid(*(2 * np.arange(n) for n in shape), indexing="ij")
+    index = launcher.array((rows * buffer.width + columns).ravel().astype(np.int32), wp.int32)
+    count = index.shape[0]
+    bounds = scene.bounds(Role.SYNTHETIC)
+    low, high = ((b - np.asarray(plan.origin)) * plan.scale for b in bounds) if bounds else (np.ones(3), np.zeros(3))
+    met, entered = launcher.empty(count, wp.int32), launcher.empty(count, wp.int32)
+    nearness = launcher.empty(count, wp.float32)
+    inputs = [buffer.points, index, device_scene.geometry, wp.vec3(*low), wp.vec3(*high), RAYS, 0]
+    launcher.launch(kernels._look_around, count, inputs, [met, entered, nearness])
+    found = met.numpy().astype(np.float64)
+    missing = found < 0
+    shares = (found / RAYS, entered.numpy() / RAYS, nearness.numpy().astype(np.float64))
+    full = [np.where(missing, np.nan if k < 2 else 0.0, a).reshape(shape) for k, a in enumerate(shares)]
+    met_all, entered_all, near_all = (a.repeat(2, 0).repeat(2, 1)[: buffer.height, : buffer.width] for a in full)
+    return met_all, entered_all, near_all
 
 
 def _near(scene: Scene, plan: Plan, buffer: GBuffer, real: np.ndarray) -> float:
