@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from warp_dvct.device_scene import DeviceScene, camera_frame
+from warp_dvct.enclosure import within_enclosure
 from warp_dvct.errors import OptionError
 from warp_dvct.kept import Kept, content_key
 from warp_dvct.launch import Launcher
@@ -112,9 +113,10 @@ class Relighter:
         self.width, self.height = self._picture_size()
         if self._launcher.checker is not None:
             self._launcher.checker.width, self._launcher.checker.height = self.width, self.height
-        # Point clouds are drawn as surfels; behind a lens that bends, a pinhole's picture of another size is drawn.
+        # Point clouds are drawn as surfels, without what lies behind the walls of a closed room; behind a lens that
+        # bends, a pinhole's picture of another size is drawn.
         self._lens = LensView.of(self.scene.camera, self.width, self.height)
-        self._drawn = with_surfels(self.scene)
+        self._drawn = within_enclosure(with_surfels(self.scene))
         if self._lens is not None:
             self._drawn = replace(self._drawn, camera=self._lens.camera)
         self._plan(has_plate=self.scene.plate is not None or self._had_plate)
