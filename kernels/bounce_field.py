@@ -22,6 +22,7 @@ class BounceField:
     position: wp.array(dtype=wp.vec3)  # of the patches
     has_walls: wp.int32
     walls: wp.array(dtype=wp.vec4)  # plane of the thin wall in a record of the level: normal and offset; or 0
+    patch_walls: wp.array(dtype=wp.vec4)  # of the thin wall beside each patch
     irradiance: wp.array(dtype=wp.vec3)  # [patches * 2], before and after
 
 
@@ -65,6 +66,22 @@ def record_of(field: BounceField, position: wp.vec3) -> int:
     )
 
 
+@wp.func
+def off_surface(field: BounceField, position: wp.vec3, normal: wp.vec3) -> wp.vec3:
+    """A point just off its surface: off the wall that this may be, and, where the surface lies between two voxels, in
+    the one that holds what stands on it."""
+    return position + normal * (WALL_MARGIN * field.volume.voxel * float(1 << field.level))
+
+
+@wp.func
+def wall_beside(field: BounceField, point: wp.vec3) -> wp.vec4:
+    """The thin wall in the voxel of a point; 0 where there is none."""
+    record = record_of(field, point)
+    if record < 0:
+        return wp.vec4(0.0, 0.0, 0.0, 0.0)
+    return field.walls[record - field.level_first]
+
+
 @wp.func(inline=False)
 def interpolated(field: BounceField, position: wp.vec3, normal: wp.vec3, at: wp.vec3, wall: wp.vec4) -> BouncedSum:
     """Patches of the faces that a normal shows on, trilinear around ``at``; those that a wall parts from ``position``
@@ -96,7 +113,7 @@ def interpolated(field: BounceField, position: wp.vec3, normal: wp.vec3, at: wp.
                         if field.has_walls != 0:
                             place = field.position[patch]
                             parted = is_parted(wall, position, place) or is_parted(
-                                field.walls[record - field.level_first], position, place
+                                field.patch_walls[patch], position, place
                             )
                         if parted:
                             weight *= HIDDEN_SHARE
@@ -123,16 +140,14 @@ def bounced_irradiance(field: BounceField, position: wp.vec3, normal: wp.vec3) -
     result.after = wp.vec3(0.0, 0.0, 0.0)
     if field.present == 0:
         return result
-    size = field.volume.voxel * float(1 << field.level)
     wall = wp.vec4(0.0, 0.0, 0.0, 0.0)
     point = position
     if field.has_walls != 0:
-        point = position + normal * (WALL_MARGIN * size)
-        record = record_of(field, point)
-        if record >= 0:
-            wall = field.walls[record - field.level_first]
+        point = off_surface(field, position, normal)
+        wall = wall_beside(field, point)
     total = interpolated(field, point, normal, position, wall)
     if total.open == 0.0 and wp.length_sq(wall) > 0.0:
+        size = field.volume.voxel * float(1 << field.level)
         away = wp.vec3(wall[0], wall[1], wall[2]) * wp.sign(wall_side(wall, point)) * size
         farther = interpolated(field, point, normal, position + away, wall)
         if farther.open > 0.0:

@@ -7,11 +7,12 @@ further bounce only follows the links from patch to patch.
 import warp as wp
 
 from warp_dvct.kernels.bounce_field import (
-    WALL_MARGIN,
     BounceField,
     bounced_irradiance,
     is_parted,
+    off_surface,
     record_of,
+    wall_beside,
     wall_side,
 )
 from warp_dvct.kernels.gather import World, radiosity_at
@@ -23,6 +24,8 @@ from warp_dvct.kernels.volume import Volume, brick_extent, face_of, face_weight,
 wp.set_module_options({"enable_backward": False})
 
 WALL_AREA = wp.constant(0.25)  # share of its voxel's face that a side of a thin wall covers
+CLEARLY = wp.constant(1.05)  # how much larger a wall has to be than another of the same voxel: equal ones stay in order
+THIN = wp.constant(0.25)  # thickest wall, in voxels of the patches' level
 OPPOSITE = wp.constant(-0.9)  # cosine between the normals of a wall's two sides
 
 
@@ -195,13 +198,14 @@ def _choose_patches(
 
 
 @wp.func
-def backs(patches: Patches, table: wp.array(dtype=wp.int32), front: int, place: int) -> bool:
-    """Whether the patch at ``place`` of the table is the other side of the wall that ``front`` belongs to."""
+def backs(patches: Patches, table: wp.array(dtype=wp.int32), front: int, place: int, thickness: float) -> bool:
+    """Whether the patch at ``place`` of the table is the other side of the wall that ``front`` belongs to, no farther
+    behind it than ``thickness``."""
     back = table[place]
     if back < 0 or patches.area[back] < WALL_AREA:
         return False
-    behind = wp.dot(patches.position[back] - patches.position[front], patches.normal[front]) <= 0.0
-    return behind and wp.dot(patches.normal[back], patches.normal[front]) < OPPOSITE
+    behind = wp.dot(patches.position[front] - patches.position[back], patches.normal[front])
+    return behind >= 0.0 and behind <= thickness and wp.dot(patches.normal[back], patches.normal[front]) < OPPOSITE
 
 
 @wp.kernel
@@ -216,34 +220,42 @@ def _find_walls(
     wall_out: wp.array(dtype=wp.vec4),
     found_out: wp.array(dtype=wp.int32),
 ):
-    """The plane of a wall thinner than a voxel or two: a face whose opposite, in its voxel or the next one behind,
-    shows a surface that looks the other way. 0 where there is none."""
+    """The plane of a wall thinner than a quarter of a voxel: a face whose opposite, in its voxel or the next one
+    behind, shows a surface that looks the other way. 0 where there is none."""
     i = first + wp.tid()
+    thickness = THIN * volume.voxel * float(1 << level)
     cell = key_cell(level_key_in[i], brick_extent(volume.n, level))
     wall_out[i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
     found_out[i] = 0
     most = float(WALL_AREA)
     for face in range(6):
         front = table_in[6 * i + face]
-        if front >= 0 and patches.area[front] >= most:
+        if front >= 0 and patches.area[front] > most:
             opposite = face ^ 1
             step = wp.vec3i(0, 0, 0)
             step[face / 2] = wp.where((face & 1) == 0, -1, 1)
             next = find_record(volume, level, cell[0] + step[0], cell[1] + step[1], cell[2] + step[2]) - level_first
             offset = wp.dot(patches.normal[front], patches.position[front])
             found = False
-            if backs(patches, table_in, front, 6 * i + opposite):
+            if backs(patches, table_in, front, 6 * i + opposite, thickness):
                 # Both sides are in this voxel: the middle is between them.
                 back = table_in[6 * i + opposite]
                 offset = 0.5 * (offset + wp.dot(patches.normal[front], patches.position[back]))
                 found = True
             elif next >= 0:
-                found = backs(patches, table_in, front, 6 * next + opposite)
+                found = backs(patches, table_in, front, 6 * next + opposite, thickness)
             if found:
-                most = patches.area[front]
+                most = patches.area[front] * CLEARLY
                 n = patches.normal[front]
                 wall_out[i] = wp.vec4(n[0], n[1], n[2], offset)
                 found_out[i] = 1
+
+
+@wp.kernel
+def _wall_of_patches(first: int, patches: Patches, field: BounceField, wall_out: wp.array(dtype=wp.vec4)):
+    """The thin wall beside each patch."""
+    i = first + wp.tid()
+    wall_out[i] = wall_beside(field, off_surface(field, patches.position[i], patches.normal[i]))
 
 
 @wp.func
@@ -268,10 +280,10 @@ def patch_at(field: BounceField, position: wp.vec3, normal: wp.vec3) -> int:
         return -1
     best = patch_behind(field, record, normal)
     if best >= 0 and field.has_walls != 0:
-        wall = field.walls[record - field.level_first]
-        size = field.volume.voxel * float(1 << field.level)
-        point = position + normal * (WALL_MARGIN * size)
+        point = off_surface(field, position, normal)
+        wall = wall_beside(field, point)
         if is_parted(wall, point, field.position[best]):
+            size = field.volume.voxel * float(1 << field.level)
             away = wp.vec3(wall[0], wall[1], wall[2]) * (wp.sign(wall_side(wall, point)) * size)
             record = record_of(field, position + away)
             if record >= 0:

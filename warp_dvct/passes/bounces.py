@@ -28,6 +28,7 @@ class Patches:
         data: ``kernels.Patches``. count: How many.
         table: int ``[records of the level * 6]``, patch of a face or -1.
         walls: vec4 ``[records of the level]``, planes of thin walls or 0. has_walls: Whether there are any.
+        patch_walls: vec4 ``[count]``, of the walls beside patches.
     """
 
     voxels: Voxels
@@ -38,6 +39,7 @@ class Patches:
     table: Any
     walls: Any
     has_walls: bool
+    patch_walls: Any
 
 
 def mean_albedo(launcher: Launcher, scene: DeviceScene, voxels: Voxels, normals: Any) -> Any:
@@ -121,7 +123,13 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
         [voxels.volume, level, level_first, voxels.level_keys[level], data, table],
         [walls, found],
     )
-    return Patches(voxels, level, level_first, data, count, table, walls, bool(found.numpy().any()))
+    beside = launcher.zeros(max(1, count), wp.vec4)
+    patches = Patches(voxels, level, level_first, data, count, table, walls, bool(found.numpy().any()), beside)
+    if patches.has_walls:
+        launcher.launch(
+            kernels._wall_of_patches, count, [data, bounce_field(launcher, patches, data.position)], [beside]
+        )
+    return patches
 
 
 def solve_bounces(
@@ -190,12 +198,13 @@ def bounce_field(launcher: Launcher, patches: Patches | None, total: Any = None)
         field.volume = Volume()
         field.table, field.real = launcher.zeros(1, wp.int32), launcher.zeros(1, wp.int32)
         field.position, field.irradiance = launcher.zeros(1, wp.vec3), launcher.zeros(1, wp.vec3)
-        field.walls = launcher.zeros(1, wp.vec4)
+        field.walls, field.patch_walls = launcher.zeros(1, wp.vec4), launcher.zeros(1, wp.vec4)
         return field
     field.volume = patches.voxels.volume
     field.level, field.level_first = patches.level, patches.level_first
     field.table, field.real, field.irradiance = patches.table, patches.data.real, total
     field.position, field.walls, field.has_walls = patches.data.position, patches.walls, int(patches.has_walls)
+    field.patch_walls = patches.patch_walls
     return field
 
 
