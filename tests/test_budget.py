@@ -25,6 +25,7 @@ from warp_dvct.cost import (
 )
 from warp_dvct.errors import FileError, OptionError
 from warp_dvct.launch import Launcher
+from warp_dvct.scene import PointCloud, Role
 from warp_dvct.settings import NAMES, make_settings
 from warp_dvct.survey import Survey, survey
 from warp_dvct.usd.read import read_stage
@@ -418,3 +419,20 @@ def test_a_budget_that_buys_nothing_more_is_said(surveys):
     assert choice.seconds < 9_000
     assert "more would not show" in choice.describe()
     assert not chosen(surveys, seconds=1.0).enough
+
+
+def test_a_scan_s_points_are_part_of_what_is_surveyed(monkeypatch, tmp_path):
+    """Point clouds are drawn as surfels; a budget that did not see them would find less of the scene."""
+    from warp_dvct import planning
+
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    scene, found = read_stage(path("colour_bleeding")), []
+    whole = planning.survey
+    monkeypatch.setattr(planning, "survey", lambda *args, **kwargs: found.append(whole(*args, **kwargs)) or found[-1])
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (50, 3))
+    up = np.tile(np.float32([0.0, 1.0, 0.0]), (50, 1))
+    cloud = PointCloud(points, up, np.full(50, 0.01, np.float32), Role.REAL)
+    for clouds in ((), (cloud,)):
+        Relighter(replace(scene, point_clouds=clouds), width=48).keep_budget(3.0)
+    assert found[1].real_triangles >= found[0].real_triangles + 50
+    assert found[1].synthetic_triangles == found[0].synthetic_triangles

@@ -142,18 +142,16 @@ def direct_work(settings: Settings, survey: Survey, pixels: float, edges: float)
     depth = math.log2(2.0 + survey.synthetic_triangles)
     probes = draws(min(settings.shadows_probes, settings.shadows_samples), settings, pixels, edges)
     samples = draws(settings.shadows_samples, settings, pixels, edges)
-    object_probes = draws(
-        min(settings.shadows_probes, settings.shadows_samples),
-        settings,
-        survey.object * pixels,
-        survey.edge.object * edges,
-    )
+    on_objects = survey.object * pixels, survey.edge.object * edges
+    object_probes = draws(min(settings.shadows_probes, settings.shadows_samples), settings, *on_objects)
+    object_samples = draws(settings.shadows_samples, settings, *on_objects)
     return {
         "frame": 1,
         "probes": probes * survey.lights,
         "near probes deep": survey.near * probes * depth,
         "near deep": survey.near * samples * depth,
         "object probes deep": object_probes * survey.lights * tree_depth(survey),
+        "object deep": object_samples * survey.lights * tree_depth(survey),
         "before deep": 0.0 if survey.plate else samples * survey.lights * tree_depth(survey),
         "points": pixels + edges,
     }

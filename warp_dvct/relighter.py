@@ -153,11 +153,10 @@ class Relighter:
         from warp_dvct.planning import choose_settings
 
         choice = choose_settings(
-            self.scene,
+            self._drawn,
             self.method,
             self._launcher,
-            self.width,
-            self.height,
+            *self._drawn_size(),
             seconds=seconds,
             max_error=max_error,
             has_plate=has_plate,
@@ -221,10 +220,15 @@ class Relighter:
 
     def _plan(self, *, has_plate: bool) -> None:
         self._planned_plate = has_plate
-        size = (self.width, self.height)
+        self._current_plan = make_plan(
+            self._drawn, self.settings, self.method, *self._drawn_size(), has_plate=has_plate
+        )
+
+    def _drawn_size(self) -> tuple[int, int]:
+        """Of the picture that is drawn, before a lens bends it."""
         if self._lens is not None:
-            size = self._lens.drawn_width, self._lens.drawn_height
-        self._current_plan = make_plan(self._drawn, self.settings, self.method, *size, has_plate=has_plate)
+            return self._lens.drawn_width, self._lens.drawn_height
+        return self.width, self.height
 
     def _through_lens(self, radiance: Radiance) -> Radiance:
         """What was drawn as the camera's lens shows it."""
