@@ -12,10 +12,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from warp_dvct.accuracy import FILLED, LADDERS_OF, Accuracy, Ladder, load_accuracy, matters
+from warp_dvct.accuracy import DETAIL, FILLED, LADDERS_OF, Accuracy, Ladder, load_accuracy, matters
 from warp_dvct.cost import CostModel, Counts, count_survey, count_work
 from warp_dvct.cost_vpls import count_vpl_work
 from warp_dvct.errors import OptionError
+from warp_dvct.passes.gather import FINEST
 from warp_dvct.settings import NAMES, Settings, make_settings
 from warp_dvct.survey import Survey
 
@@ -256,6 +257,8 @@ class _Chooser:
         ]
         for ladder in self.ladders:
             value = state[ladder.knob]
+            if ladder.knob == DETAIL and settings.gather_stride <= FINEST:
+                continue  # there is nothing to halve
             bought = self.settings({**state, ladder.knob: ladder.values[0]})
             share = max(0.0, self.square(bought) / max(square, 1e-12) - 1.0)
             saved = self.seconds(settings) - self.seconds(bought)

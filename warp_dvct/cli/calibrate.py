@@ -14,11 +14,11 @@ from warp_dvct.image import check_writable
 @click.command()
 @click.option("--device", default="cpu", show_default=True, metavar="DEVICE", help="cpu, cuda or cuda:N.")
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="CPU threads. Default: all cores.")
-@click.option("--frames", type=int, default=8, show_default=True, help="Of each of five scenes.")
+@click.option("--frames", type=int, default=8, show_default=True, help="Of each of six scenes.")
 @click.option("--seed", type=int, default=1, show_default=True, help="Of the settings that are drawn.")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="Write the model there instead.")
 def calibrate(device: str, threads: int | None, frames: int, seed: int, out: Path | None) -> None:
-    """Measure what frames cost on this machine; `relight --budget` then keeps its word. Takes about a minute."""
+    """Measure what frames cost on this machine; `relight --budget` then keeps its word. Takes about two minutes."""
     if out is not None:
         check_writable(out)
     start_warp(device)
@@ -29,8 +29,9 @@ def calibrate(device: str, threads: int | None, frames: int, seed: int, out: Pat
         model, samples = measure(device, threads, frames=frames, seed=seed, report=progress.update)
     file = out or model_file(device)
     save_model(model, file)
+    fitted = sum("survey" not in sample.work for sample in samples)
     click.echo(
-        f"{file}: fitted to {len(samples) // 2} frames on {model.threads} thread(s) of {model.machine};"
+        f"{file}: fitted to {fitted} frames on {model.threads} thread(s) of {model.machine};"
         f" measured over predicted processor time varies by {model.spread:.0%}"
     )
     if model.threads > 1 and max(model.speedup.values()) < 1.1:
