@@ -45,16 +45,18 @@ def compare(kernel: Any, output: str, got: np.ndarray, twin: np.ndarray) -> Devi
 
 def measure_all(launcher: Any) -> list[Deviation]:
     """Every twin, in the order of the passes."""
-    from warp_dvct.bench.twins import direct, indirect, pictures, surfaces, volumes, vpls
+    from warp_dvct.bench.twins import direct, frames, glossy, indirect, pictures, surfaces, volumes, vpls
 
     found: list[Deviation] = []
     measures: list[Callable[[Any], Any]] = [
         *(surfaces.measure_gbuffer, direct.measure_rsm, direct.measure_direct),
         *(direct.measure_path_tracing, volumes.measure_voxels, volumes.measure_injection, volumes.measure_pyramid),
-        *(indirect.measure_cones, indirect.measure_rays, indirect.measure_specular, indirect.measure_bounces),
+        *(indirect.measure_cones, indirect.measure_rays, glossy.measure_glossy_rays),
+        *(indirect.measure_specular, indirect.measure_bounces),
         *(volumes.measure_albedos, surfaces.measure_indirect_shading),
         indirect.measure_reconstruction,
-        *(vpls.measure_warping, vpls.measure_vpls, pictures.measure_resolve, pictures.measure_pictures),
+        *(vpls.measure_warping, vpls.measure_vpls, vpls.measure_vpl_bounces, frames.measure_history),
+        *(frames.measure_lens, frames.measure_light_fit, pictures.measure_resolve, pictures.measure_pictures),
     ]
     for measure in measures:
         found += measure(launcher)

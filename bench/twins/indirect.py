@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -182,24 +183,47 @@ def measure_rays(launcher: Any) -> list[Deviation]:
 
     field = fields(voxels)[0]
     total = np.zeros((COUNT, 2, 3))
-    origin = twin.spawn(position, triangle, normal)
     for k in range(RAYS):
-        local = np.broadcast_to(cosine_hemisphere(sobol2(0, 0, k, 11)), position.shape)
-        direction = from_frame(local, normal)
-        wide = np.sqrt(np.pi / (RAYS * np.maximum(local[:, 2], 0.05)))
-        real, hit_real = twin.nearest(origin, direction, twin.real)
-        synthetic, hit_synthetic = twin.nearest(origin, direction, twin.synthetic)
-        seen = []
-        for t, hit in ((real, hit_real), (synthetic, hit_synthetic)):
-            n = twin.normals[hit]
-            n = np.where(dot(n, direction)[:, None] > 0.0, -n, n)
-            t = np.where(np.isfinite(t), t, 0.0)
-            seen.append(radiosity(field, origin + direction * t[:, None], n, wide * t))
-        total[:, 0] += np.where(np.isfinite(real)[:, None], seen[0][:, 0], 0.0) / RAYS
-        first = synthetic < real
-        total[:, 1] += np.where(first[:, None], seen[1][:, 1], np.isfinite(real)[:, None] * seen[0][:, 1]) / RAYS
+        total += incident(GatherRay.trace(twin, position, normal, triangle, k), field) / RAYS
     kernel = gather._gather_rays
     return [compare(kernel, name, got[s].numpy(), total[:, s]) for s, name in enumerate(("before", "after"))]
+
+
+@dataclass(frozen=True)
+class GatherRay:
+    """One ray of each point, and what it meets of each role: distance (inf where nothing) and triangle."""
+
+    twin: Twin
+    origin: np.ndarray
+    direction: np.ndarray
+    solid_angle: np.ndarray
+    real: tuple[np.ndarray, np.ndarray]
+    synthetic: tuple[np.ndarray, np.ndarray]
+
+    @staticmethod
+    def trace(twin: Twin, position: np.ndarray, normal: np.ndarray, triangle: np.ndarray, k: int) -> GatherRay:
+        """Ray ``k`` of the picture's sequence, cosine-distributed."""
+        local = np.broadcast_to(cosine_hemisphere(sobol2(0, 0, k, 11)), position.shape)
+        origin, direction = twin.spawn(position, triangle, normal), from_frame(local, normal)
+        met = (twin.nearest(origin, direction, part) for part in (twin.real, twin.synthetic))
+        return GatherRay(twin, origin, direction, np.pi / (RAYS * np.maximum(local[:, 2], 0.05)), *met)
+
+    @property
+    def blocked(self) -> np.ndarray:
+        """Whether something synthetic is met first."""
+        return self.synthetic[0] < self.real[0]
+
+
+def incident(ray: GatherRay, field: np.ndarray) -> np.ndarray:
+    """Radiosity where a ray ends, before and after: ``[n, solution, 3]``."""
+    seen = []
+    for t, hit in (ray.real, ray.synthetic):
+        n = ray.twin.normals[hit]
+        n = np.where(dot(n, ray.direction)[:, None] > 0.0, -n, n)
+        at = np.where(np.isfinite(t), t, 0.0)
+        light = radiosity(field, ray.origin + ray.direction * at[:, None], n, np.sqrt(ray.solid_angle) * at)
+        seen.append(np.where(np.isfinite(t)[:, None, None], light, 0.0))
+    return np.stack([seen[0][:, 0], np.where(ray.blocked[:, None], seen[1][:, 1], seen[0][:, 1])], 1)
 
 
 def measure_bounces(launcher: Any) -> list[Deviation]:

@@ -18,6 +18,7 @@ from warp_dvct.passes.injection import empty_flux, inject
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
 from warp_dvct.passes.rsm import ShadowMaps, render_rsm
 from warp_dvct.passes.voxels import Box, Voxels, voxelize
+from warp_dvct.scene import Scene
 
 N = 12
 FACES = np.array([(s if k == axis else 0.0) for axis in range(3) for s in (1.0, -1.0) for k in range(3)]).reshape(6, 3)
@@ -131,9 +132,9 @@ def measure_voxels(launcher: Any) -> list[Deviation]:
     return [compare(voxelization._sum_areas, "area", got.reshape(-1, 12), expected.reshape(-1, 12))]
 
 
-def lit(launcher: Any) -> tuple[Twin, Voxels, ShadowMaps, Any]:
+def lit(launcher: Any, scene: Scene | None = None) -> tuple[Twin, Voxels, ShadowMaps, Any]:
     """The scene's voxels, the RSM pair of its light, and what is injected of it."""
-    twin = Twin.upload(launcher, make_scene(POINT))
+    twin = Twin.upload(launcher, scene or make_scene(POINT))
     voxels = voxels_of(launcher, twin)
     maps = render_rsm(launcher, twin.device, 0, 64, center=(0.5, 0.5, 0.5), radius=0.8, start=2.0)
     flux = empty_flux(launcher, voxels)

@@ -1,4 +1,5 @@
-"""Twins of instant radiosity: hierarchical warping, VPLs' light with exact visibility, parabolic shadow maps."""
+"""Twins of instant radiosity: hierarchical warping, VPLs' light with exact visibility, their further bounces, parabolic
+shadow maps."""
 
 from __future__ import annotations
 
@@ -9,9 +10,9 @@ import warp as wp
 
 from warp_dvct.bench.twins.deviation import Deviation, compare
 from warp_dvct.bench.twins.indirect import COUNT, places
-from warp_dvct.bench.twins.numbers import cosine_hemisphere, dot, from_frame
+from warp_dvct.bench.twins.numbers import cosine_hemisphere, dot, from_frame, sobol2
 from warp_dvct.bench.twins.stage import POINT, Twin, make_scene
-from warp_dvct.kernels import ism, vpl_shading, warping
+from warp_dvct.kernels import ism, vpl_bounces, vpl_shading, warping
 from warp_dvct.kernels import vpls as kernels
 from warp_dvct.passes.ism import ray_sight
 from warp_dvct.passes.vpl_shading import VplLight
@@ -19,6 +20,7 @@ from warp_dvct.passes.vpls import new_vpls
 from warp_dvct.passes.warping import build_importance, texel_probabilities
 
 VPLS = 48
+DRAWS = 8
 
 
 def measure_warping(launcher: Any) -> list[Deviation]:
@@ -82,6 +84,77 @@ def measure_vpls(launcher: Any) -> list[Deviation]:
         compare(kernel, "after", got[1].numpy(), after),
     ]
     return [*rows, spread_row(launcher, vpls, numbers), pull_row(launcher)]
+
+
+def measure_vpl_bounces(launcher: Any) -> list[Deviation]:
+    """What points of surfaces send on of the VPLs that they draw by flux, apart for light that both solutions have
+    (Knecht et al. 2012, eqs. 9 and 10)."""
+    twin = Twin.upload(launcher, make_scene(POINT))
+    _, position, normal, triangle = places(launcher, twin)
+    vpls, numbers = random_vpls(launcher, twin)
+    rng = np.random.default_rng(15)
+    reach = 0.9
+    cdf = np.concatenate([[0.0], np.cumsum(rng.uniform(0.2, 1.0, VPLS))]).astype(np.float32)
+    cdf /= cdf[-1]
+    area, albedo = (rng.uniform(0.1, 1.0, shape).astype(np.float32) for shape in (COUNT, (COUNT, 3)))
+    inserted = triangle >= twin.reals
+    cloud = ism.Cloud()
+    cloud.count = cloud.block = COUNT
+    cloud.position, cloud.normal, cloud.albedo = (
+        launcher.array(v.astype(np.float32), wp.vec3) for v in (position, normal, albedo)
+    )
+    cloud.area, cloud.synthetic = launcher.array(area, wp.float32), launcher.array(inserted.astype(np.int32), wp.int32)
+    sources = vpl_bounces.Sources()
+    sources.count, sources.draws, sources.reach = VPLS, DRAWS, reach
+    sources.cdf = launcher.array(cdf, wp.float32)
+    out = []
+    for _ in range(2):
+        candidates = vpl_bounces.Candidates()
+        for name, variable in vpl_bounces.Candidates.vars.items():
+            setattr(candidates, name, launcher.zeros(COUNT, variable.type.dtype))
+        out.append(candidates)
+    given = [twin.device.geometry, cloud, ray_sight(launcher), sources, vpls]
+    launcher.launch(vpl_bounces._light_candidates, COUNT, given, out)
+
+    sums = np.zeros((2, COUNT, 3))
+    for draw in range(DRAWS):
+        u = sobol2(0, np.arange(COUNT), draw, 45)[:, 0]
+        k = np.searchsorted(cdf, u.astype(np.float32), side="right") - 1
+        flux, common = sent_on(twin, {n: v[k] for n, v in numbers.items()}, position, normal, inserted, reach)
+        leaving = flux * albedo * (area / ((cdf[k + 1].astype(float) - cdf[k]) * DRAWS))[:, None]
+        for s, chosen in enumerate((common, ~common)):
+            sums[s] += leaving * chosen[:, None]
+    return [
+        compare(vpl_bounces._light_candidates, f"{name}.flux", got.flux.numpy(), twin_sum)
+        for name, got, twin_sum in zip(("common", "changed"), out, sums, strict=True)
+    ]
+
+
+def sent_on(
+    twin: Twin,
+    vpl: dict[str, np.ndarray],
+    position: np.ndarray,
+    normal: np.ndarray,
+    inserted: np.ndarray,
+    reach: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Irradiance of each point, on the side that its VPL is on, and whether both solutions have it."""
+    normal = np.where(dot(vpl["position"] - position, normal)[:, None] < 0.0, -normal, normal)
+    origin = position + normal * (2.0e-6 * reach)
+    d = vpl["position"] - origin
+    distance = np.linalg.norm(d, axis=-1)
+    toward = d / distance[:, None]
+    leaving, arriving = -dot(toward, vpl["normal"]), dot(toward, normal)
+    form = np.where((leaving > 0) & (arriving > 0), leaving * arriving, 0.0)
+    past_real, past_inserted = (
+        twin.nearest(origin, toward, part)[0] >= 0.9999 * distance for part in (twin.real, twin.synthetic)
+    )
+    real, hidden = vpl["real"] == 1, vpl["hidden"] == 1
+    # Light of the picture before alone does not meet what is inserted; light that something inserted blocks goes on
+    # as such, where all of its path is real.
+    counts = past_real & ~(hidden & inserted) & (hidden | past_inserted | (real & ~inserted))
+    light = vpl["flux"] * (form * counts / (np.pi * (distance**2 + vpl["spread"] ** 2)))[:, None]
+    return light, real & ~hidden & past_inserted & ~inserted
 
 
 def spread_row(launcher: Any, vpls: Any, numbers: dict[str, np.ndarray]) -> Deviation:

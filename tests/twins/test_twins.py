@@ -13,6 +13,8 @@ from warp_dvct.kernels import composite
 
 HALVES = ("composite",)  # outputs are rounded to half precision: 2^-11
 LARGEST = 3e-6
+# A bilinear share is the fraction of a picture coordinate, which loses five bits where the picture is 40 pixels wide.
+SHARES = {"history": 1e-5}
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +24,7 @@ def rows(launcher) -> list[Deviation]:
 
 def test_every_deviation_is_a_few_roundings(rows):
     for row in rows:
-        assert row.largest <= (6e-4 if row.family in HALVES else LARGEST), row
+        assert row.largest <= (6e-4 if row.family in HALVES else SHARES.get(row.family, LARGEST)), row
 
 
 def test_decisions_are_the_same_but_for_a_few_rays_past_edges(rows):
@@ -36,8 +38,9 @@ def test_every_family_of_the_picture_has_a_twin(rows):
     assert families >= {
         *("gbuffer", "rsm", "shading", "path_tracing", "voxelization", "injection", "pyramid", "gather", "specular"),
         *("bounces", "reconstruction", "warping", "vpl_shading", "vpls", "ism", "resolve", "composite", "tonemap"),
-        "difference",
+        *("difference", "history", "vpl_bounces", "lens", "light_fit"),
     }
+    assert "_gather_rays_glossy" in {row.kernel for row in rows}
     assert families <= {name.rpartition(".")[2] for name in kernel_modules()}
 
 
