@@ -13,27 +13,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warp_dvct.capture.enclosure import Enclosure, find_enclosure
+from warp_dvct.capture.fusion import FusedMesh
 from warp_dvct.capture.grid import Grid, GridLimits, depth_grid, grid_mesh
 from warp_dvct.capture.intrinsics import Intrinsics
-from warp_dvct.capture.registration import sample, undistorted_depth
+from warp_dvct.capture.live_albedo import MOST_GAIN, SRGB, albedo_texture, brightness_ratio, light_ratio, nearest
+from warp_dvct.capture.registration import undistorted_depth
 from warp_dvct.capture.stage import Capture, CaptureRig, open_capture
 from warp_dvct.errors import FileError, OptionError, StageError
-from warp_dvct.image import read_plate, srgb_to_linear
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.depth_filter import DepthFilter, FilteredDepth, FilterOptions, Guide
-from warp_dvct.relighter import Relighter
-from warp_dvct.scene import Camera, Light, LightKind, LightRole, Material, Notice, Role, Scene, Texture, Wrap
+from warp_dvct.scene import Camera, Light, LightKind, LightRole, Material, Mesh, Notice, Role, Scene, Texture
 
 if TYPE_CHECKING:
     from pxr import Usd
 
-MOST_ALBEDO = 0.95  # nothing reflects more
 DARKEST = 0.02  # mean of a photograph below which its surroundings are not taken to be
 GREY = 0.5  # albedo where no photograph shows a surface; the mean one of all surfaces, where light is not known
-GAIN_WIDTH = 96  # pixels of the picture that tells how bright the known lights make the real scene
-MOST_GAIN = 4.0  # that photographs are made brighter or darker to have albedo
-CLIPPED = 0.98  # of a photograph's white: what is brighter may have been anything
-SRGB = srgb_to_linear(np.arange(256) / 255.0)
+FIT_ROUNDS = 4
+BEHIND = 0.025  # metres: about the noise of a depth camera, behind which the rest of a room lies
 
 Progress = Callable[[int, int], None]
 
@@ -44,8 +42,9 @@ class LiveOptions:
 
     Attributes:
         tolerance: How far triangles may be off the filtered depth, in the filter's ``noise`` of inverse depth.
-        surroundings: Whether what no depth image shows sends light: a dome of the photographs' mean colour, unless the
-            stage has a dome. Without it, it is black.
+        surroundings: Whether what the depth image does not show sends light, unless the stage has a dome: the rest of
+            the room where lamps are known and the picture looks like that of one, else a dome of the photographs' mean
+            colour. Without it, it is black.
         filter: Of the depth.
     """
 
@@ -91,7 +90,8 @@ class LiveSource:
         self._next = 0
         self._filtered: FilteredDepth | None = None
         self._mean: np.ndarray | None = None
-        self._gain: float | None = None
+        self._factor: float | None = None
+        self._trial = 1.0
         self.skipped: list[str] = []
 
     @property
@@ -149,28 +149,73 @@ class LiveSource:
         kept = tuple(mesh for mesh in scene.meshes if mesh.role == Role.SYNTHETIC)
         clouds = tuple(cloud for cloud in scene.point_clouds if cloud.role == Role.SYNTHETIC)
         grid = self._grid(filtered)
-        lights, gain, notices = self._lights(scene)
-        if fit and color is not None and _plate_lights(scene.lights):
-            gain = gain * self._fitted_gain()
-        surface = Material(
-            base_color=(GREY, GREY, GREY), roughness=1.0, ior=1.0, name=f"{self.capture.depth_path} (live)"
-        )
-        textures, uvs = scene.textures, None
-        if color is not None:
-            surface = replace(surface, base_color_texture=len(textures))
-            textures = (*textures, _albedo_texture(color, gain, self.capture.color_file(index) or ""))
-            uvs = _texture_coordinates(grid, self.capture.rig)
-        mesh = grid_mesh(grid, pose, len(scene.materials), uvs, self.capture.depth_path)
-        return replace(
+        known = bool(_plate_lights(scene.lights))
+        factor = self._fitted(known) if fit and color is not None else self._trial
+        mesh = grid_mesh(grid, pose, len(scene.materials), None, self.capture.depth_path)
+        box = self._room(scene.lights, mesh, pose)
+        lights, balance, notices = (scene.lights, np.ones(3), ()) if box is not None else self._lights(scene, factor)
+        if box is not None:
+            notices = (Notice(self.capture.path, "unseen parts of the room are taken to be as what the picture shows"),)
+        scene = replace(
             scene,
-            meshes=(mesh, *kept),
-            materials=(*scene.materials, surface),
-            textures=textures,
+            meshes=kept,
             point_clouds=clouds,
             lights=lights,
             notices=(*scene.notices, *notices),
             captured=True,
         )
+        if color is None:
+            return self._with_real(scene, mesh, box)
+        uvs = _texture_coordinates(grid, self.capture.rig)
+        mesh = replace(mesh, corner_uvs=uvs.astype(np.float32)[grid.triangles])
+        file, photo = self.capture.color_file(index) or "", SRGB[color]
+        gain = balance * factor if known else balance
+        made = self._with_real(scene, mesh, box, albedo_texture(photo, gain, file), uvs)
+        if not fit:
+            return made
+        gain = gain * light_ratio(made, photo, self._launcher, 0.5 if known else 0.0)
+        return self._with_real(scene, mesh, box, albedo_texture(photo, gain, file), uvs)
+
+    def _with_real(
+        self,
+        scene: Scene,
+        mesh: Mesh,
+        box: Enclosure | None,
+        texture: Texture | None = None,
+        uvs: np.ndarray | None = None,
+    ) -> Scene:
+        """``scene`` with the live surface, its material the next one, and the rest of the room around it."""
+        surface = Material(
+            base_color=(GREY, GREY, GREY),
+            roughness=1.0,
+            ior=1.0,
+            base_color_texture=None if texture is None else len(scene.textures),
+            name=f"{self.capture.depth_path} (live)",
+        )
+        meshes, materials, albedo = (mesh,), (surface,), np.full((len(mesh.points), 3), GREY)
+        if texture is not None and uvs is not None:
+            albedo = nearest(texture.pixels, uvs)
+        if box is not None:
+            path = f"{self.capture.depth_path} (surroundings)"
+            white = Material(base_color=(1.0, 1.0, 1.0), roughness=1.0, ior=1.0, name=path)
+            materials = (surface, white)
+            meshes = (mesh, _box_mesh(box, albedo, len(scene.materials) + 1, path))
+        return replace(
+            scene,
+            meshes=(*meshes, *scene.meshes),
+            materials=(*scene.materials, *materials),
+            textures=scene.textures if texture is None else (*scene.textures, texture),
+        )
+
+    def _room(self, lights: tuple[Light, ...], mesh: Mesh, pose: np.ndarray) -> Enclosure | None:
+        """The rest of the room around a frame's surface; None where that is no room, or is not wanted."""
+        if not self._options.surroundings:
+            return None
+        normals = np.zeros((len(mesh.points), 3), np.float32)
+        assert mesh.corner_normals is not None
+        normals[mesh.triangles] = mesh.corner_normals
+        shown = FusedMesh(mesh.points, normals, None, mesh.triangles, {}, 1, 1, 0)
+        return find_enclosure(shown, pose[:3, 3], _plate_lights(lights), voxel=BEHIND)
 
     def filtered(self, time: float | None = None) -> FilteredDepth:
         """The filtered depth of a frame, in the depth camera."""
@@ -209,11 +254,11 @@ class LiveSource:
             return None
         return Guide(color, (lens.fx, lens.fy, lens.cx, lens.cy), self.capture.rig.depth_to_color)
 
-    def _lights(self, scene: Scene) -> tuple[tuple[Light, ...], np.ndarray, tuple[Notice, ...]]:
+    def _lights(self, scene: Scene, level: float) -> tuple[tuple[Light, ...], np.ndarray, tuple[Notice, ...]]:
         """Lights, what to multiply photographs by to have albedo, and what to tell the user.
 
-        Where the stage has no light of the photograph, the dome is so bright that the mean albedo is :data:`GREY`.
-        Else photographs are albedo up to one factor.
+        Where the stage has no light of the photograph, the mean albedo is :data:`GREY` and ``level`` makes the dome so
+        bright that the picture is as bright as its photograph. Else photographs are albedo up to one factor.
         """
         plate_lights = _plate_lights(scene.lights)
         known = any(light.kind == LightKind.DOME for light in plate_lights)
@@ -225,7 +270,7 @@ class LiveSource:
             mean = np.full(3, GREY) if first is None else np.maximum(SRGB[first].mean((0, 1)), DARKEST)
             self._mean = mean
         gain = np.ones(3) if plate_lights else GREY / mean
-        radiance = mean / (1.0 if plate_lights else GREY)
+        radiance = mean if plate_lights else mean / GREY * level
         path = f"{self.capture.depth_path} (surroundings)"
         dome = Light(LightKind.DOME, (float(radiance[0]), float(radiance[1]), float(radiance[2])), path=path)
         said = "the stage has no dome light: what no depth image shows is taken as bright as the photographs' mean"
@@ -248,17 +293,25 @@ class LiveSource:
                     said = str(error)
         raise FileError(said)
 
-    def _fitted_gain(self) -> float:
-        """The factor from photographs to albedo: with it the first frame, rendered, is as bright as its photograph."""
-        if self._gain is None:
+    def _fitted(self, known: bool) -> float:
+        """The factor with which the first frame, rendered, is as bright as its photograph: from photographs to albedo
+        where lights are known, of the surroundings' brightness where they are not."""
+        if self._factor is None:
             index = self._first_usable()
             pose = self.capture.pose(index)
             assert pose is not None
             depth, lens = undistorted_depth(self.capture.depth(index), self.capture.rig.depth)
             alone = DepthFilter(self._launcher, (lens.fx, lens.fy, lens.cx, lens.cy), lens.size, self._options.filter)
-            scene = self._assemble(index, pose, alone.update(depth, pose), fit=False)
-            self._gain = _brightness_ratio(scene, self._launcher)
-        return self._gain
+            first, color = alone.update(depth, pose), self.capture.color(index)
+            assert color is not None
+            for number in range(FIT_ROUNDS):
+                made = self._assemble(index, pose, first, fit=False)
+                ratio = brightness_ratio(made, SRGB[color], self._launcher)
+                # Light that bounces follows the albedo, so that the factor would swing around the answer.
+                self._trial *= np.sqrt(ratio) if known and number > 0 else ratio
+            self._factor = float(np.clip(self._trial, 1.0 / MOST_GAIN, MOST_GAIN))
+            self._trial = 1.0
+        return self._factor
 
     def _grid(self, filtered: FilteredDepth) -> Grid:
         options = self._options.filter
@@ -280,30 +333,16 @@ def _plate_lights(lights: tuple[Light, ...]) -> tuple[Light, ...]:
     return tuple(light for light in lights if light.role == LightRole.PLATE)
 
 
-def _brightness_ratio(scene: Scene, launcher: Launcher) -> float:
-    """How many times brighter the photograph is than the rendered real scene, on surfaces that are not clipped."""
-    real = replace(scene, meshes=scene.meshes[:1], point_clouds=(), lights=_plate_lights(scene.lights))
-    relighter = Relighter(
-        real, width=GAIN_WIDTH, quality="draft", device=launcher.device.alias, threads=launcher.threads
+def _box_mesh(box: Enclosure, albedo: np.ndarray, material: int, path: str) -> Mesh:
+    """The rest of a room as a real mesh; ``albedo`` is that of the vertices of what is seen."""
+    return Mesh(
+        points=box.points.astype(np.float64),
+        triangles=box.triangles,
+        materials=np.full(len(box.triangles), material, np.int32),
+        role=Role.REAL,
+        corner_colors=box.albedo(albedo).astype(np.float32)[box.triangles],
+        path=path,
     )
-    layers = relighter.render()
-    assert scene.plate is not None
-    photo = read_plate(scene.plate)
-    v, u = np.indices(layers.depth.shape) + 0.5
-    scale = np.array([photo.shape[1] / layers.depth.shape[1], photo.shape[0] / layers.depth.shape[0]])
-    seen, _ = sample(photo, np.stack([u, v], -1) * scale - 0.5)
-    compared = (layers.mask_real == 1.0) & (seen.max(-1) < CLIPPED)
-    rendered = float(layers.comp[compared].sum())
-    if rendered <= 0.0:
-        return 1.0
-    return float(np.clip(seen[compared].sum() / rendered, 1.0 / MOST_GAIN, MOST_GAIN))
-
-
-def _albedo_texture(color: np.ndarray, gain: np.ndarray, name: str) -> Texture:
-    """The photograph's linear colours times ``gain``: a pixel's albedo goes by its own colour, so that it never loses
-    more light than it had."""
-    pixels = np.clip(SRGB[color] * gain, 0.0, MOST_ALBEDO).astype(np.float32)
-    return Texture(pixels, Wrap.CLAMP, Wrap.CLAMP, f"{name} (albedo)")
 
 
 def _texture_coordinates(grid: Grid, rig: CaptureRig) -> np.ndarray:
