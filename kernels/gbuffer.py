@@ -202,16 +202,21 @@ def _see_synthetic(
     geo: Geometry,
     mats: Materials,
     cam: CameraFrame,
+    center: wp.vec3,
+    radius: float,
     real: Points,
     reach_in: wp.array(dtype=wp.float32),
     width: int,
     height: int,
     points_out: Points,
 ):
-    """Synthetic surfaces in front of what ``real`` holds of the real scene, and that elsewhere."""
+    """Synthetic surfaces in front of what ``real`` holds of the real scene, and that elsewhere; all of them lie within
+    ``radius`` of ``center``."""
     i = first + wp.tid()
     copy_point(real, i, points_out)
     ray = camera_ray(cam, float(i % width) + 0.5, float(i / width) + 0.5, width, height)
+    if wp.length_sq(wp.cross(center - ray.origin, ray.direction)) > radius * radius:
+        return
     hit = trace_synthetic(geo, ray.origin, ray.direction, reach_in[i])
     if hit.found != 0:
         spread = (cam.tan_right - cam.tan_left) / float(width)

@@ -23,9 +23,7 @@ from warp_dvct.check import Checker, poison
 from warp_dvct.errors import DeviceError, OptionError
 
 SLABS_PER_THREAD = 8  # enough that an uneven slab does not leave the other threads idle
-MIN_SLAB_SECONDS = (
-    1.0e-4  # less work is not worth handing to another thread
-)
+MIN_SLAB_SECONDS = 1.0e-4  # less work is not worth handing to another thread
 FIRST_GUESS = 1.0e-6  # seconds an element, of a kernel that has not run
 FORGETTING = 0.7  # of the dearest launch so far, per launch: kernels are launched with light and heavy elements in turn
 

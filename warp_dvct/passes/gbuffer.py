@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
@@ -12,6 +13,9 @@ from warp_dvct.kernels import gbuffer as kernels
 from warp_dvct.kernels.gbuffer import Points
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.voxels import scan
+
+SPHERE_MARGIN = 1.001  # of a radius: keeps rounding from culling a ray that barely meets what is in the sphere
+EDGE_SHARE = 8  # room for one edge point in so many pixels is there from the start, and saves most pictures a copy
 
 
 @dataclass(frozen=True)
@@ -76,8 +80,10 @@ def render_gbuffer(
     shared = [scene.geometry, scene.materials, scene.camera]
     centers, reach = real or see_real(launcher, scene, width, height)
     if scene.synthetic is not None:
-        seen = new_points(launcher, pixels)
-        launcher.launch(kernels._see_synthetic, pixels, [*shared, centers, reach, width, height], [seen])
+        low, high = scene.synthetic_bounds
+        sphere = wp.vec3(*(0.5 * (low + high))), 0.5 * float(np.linalg.norm(high - low)) * SPHERE_MARGIN
+        seen = new_points(launcher, pixels + pixels // EDGE_SHARE)
+        launcher.launch(kernels._see_synthetic, pixels, [*shared, *sphere, centers, reach, width, height], [seen])
         centers = seen
     mark = launcher.zeros(pixels, wp.int32)
     if edge_samples > 0:
@@ -113,12 +119,22 @@ def new_points(launcher: Launcher, count: int) -> Any:
 
 
 def extended(launcher: Launcher, points: Any, old: int, count: int) -> Any:
-    """The first ``old`` entries of ``points`` in arrays of ``count`` entries."""
-    if count == old:
-        return points
+    """The first ``old`` entries of ``points`` in arrays of ``count`` entries: the same ones where those have room."""
+    if count <= points.role.shape[0]:
+        return first_points(points, count)
     larger = new_points(launcher, count)
     launcher.launch(kernels._copy_points, old, [points], [larger])
     return larger
+
+
+def first_points(points: Any, count: int) -> Any:
+    """The first ``count`` of ``points``, on the same memory."""
+    if count == points.role.shape[0]:
+        return points
+    fewer = Points()
+    for name in Points.vars:
+        setattr(fewer, name, getattr(points, name)[: max(count, 1)])
+    return fewer
 
 
 def _look_behind(
