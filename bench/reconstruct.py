@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_dvct.bench.error import stage_file
-from warp_dvct.bench.live_capture import time_dataset, time_live
+from warp_dvct.bench.live_capture import normal_errors, time_dataset, time_live
 from warp_dvct.capture.frames import FrameList, Skipped
 from warp_dvct.capture.fusion import (
     FusedMesh,
@@ -68,10 +68,11 @@ class CaptureOptions:
 
 @dataclass
 class Report:
-    """Figures: milliseconds a frame (wall and processor), metres, FLIP of each picture."""
+    """Figures: milliseconds a frame (wall and processor), degrees (raw and filtered), metres, FLIP of each picture."""
 
     stage: str
     milliseconds: dict[str, tuple[float, float]] = field(default_factory=dict)
+    normals: tuple[float, float] = (0.0, 0.0)
     distance: tuple[float, float] = (0.0, 0.0)
     floating: float = 0.0
     triangles: int = 0
@@ -99,6 +100,7 @@ def measure(stage: str, options: CaptureOptions) -> Report:
             fuse(CaptureFrames(capture), fusion, threads=options.threads)
         _time_integration(capture, fusion, options, report)
         truth = read_stage(file)
+        report.normals = normal_errors(capture, truth, Launcher(options.device, options.threads))
         probe = lights_layer(file, Path(folder) / "lights.usda")
         target = Path(folder) / "scene.usda"
         with _timed(report, "everything, with light and albedo", len(capture)):
@@ -259,7 +261,9 @@ def format_report(report: Report, options: CaptureOptions) -> str:
         f"  drift by {name:<27} {1e3 * off:8.1f} mm over {options.tracked} frames" for name, off in report.drift.items()
     ]
     flips = " ".join(f"{f:8.4f}" for f in report.flip)
+    raw, filtered = report.normals
     lines += [
+        f"  normals, raw and filtered            {raw:8.1f} {filtered:8.1f} degrees   (aim: half)",
         f"  surface to truth, median             {1e3 * report.distance[0]:8.2f} mm   (aim {1e3 * MEDIAN:g})",
         f"  surface to truth, 95 %               {1e3 * report.distance[1]:8.2f} mm   (aim {1e3 * TAIL:g})",
         f"  more than {1e2 * FLOATING:g} cm off the truth         {1e4 * report.floating:8.2f} cm2 of the surface",

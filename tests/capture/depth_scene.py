@@ -5,6 +5,8 @@ from __future__ import annotations
 import lit_scenes as lit
 import numpy as np
 
+from warp_dvct.bench.live_capture import angle as angle
+from warp_dvct.bench.live_capture import paper_normals as paper_normals
 from warp_dvct.capture.intrinsics import Intrinsics
 from warp_dvct.capture.paths import look_at
 from warp_dvct.capture.simulate import DepthEye
@@ -33,21 +35,3 @@ def poses(count: int, step: float = 0.03) -> list[np.ndarray]:
 def seen(launcher: Launcher, scene: Scene, lens: Intrinsics, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """True depth and normals."""
     return DepthEye(launcher, scene, lens).look(pose)
-
-
-def angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Between unit vectors [degrees]."""
-    return np.degrees(np.arccos(np.clip((a * b).sum(-1), -1.0, 1.0)))
-
-
-def paper_normals(depth: np.ndarray, lens: Intrinsics) -> np.ndarray:
-    """N = (V(u+1,v) - V(u,v)) x (V(u,v+1) - V(u,v)), towards the camera; 0 where a vertex is missing."""
-    points = lens.rays() * depth[..., None]
-    normal = np.zeros_like(points)
-    here, right, below = points[:-1, :-1], points[:-1, 1:], points[1:, :-1]
-    cross = np.cross(right - here, below - here)
-    cross *= -np.sign((cross * here).sum(-1, keepdims=True))
-    whole = (depth[:-1, :-1] > 0) & (depth[:-1, 1:] > 0) & (depth[1:, :-1] > 0)
-    length = np.linalg.norm(cross, axis=-1, keepdims=True)
-    normal[:-1, :-1] = np.where(whole[..., None] & (length > 0), cross / np.maximum(length, 1e-30), 0.0)
-    return normal
