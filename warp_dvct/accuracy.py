@@ -89,7 +89,7 @@ VPL_LADDERS = (
 LADDERS_OF = {"delta-cones": LADDERS, "instant-radiosity": VPL_LADDERS}
 # By method, settings that the reference does not share with the preset ``balanced``.
 REFERENCE_OF = {"delta-cones": REFERENCE, "instant-radiosity": {"bounces": 8}}
-FILLED = {"delta-cones": RAYS, "instant-radiosity": "vpls.further"}  # takes the rest of a budget, in steps of one
+FILLED = {"delta-cones": RAYS, "instant-radiosity": VPLS}  # takes the rest of a budget, in steps of one
 
 
 @dataclass(frozen=True)

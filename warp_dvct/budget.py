@@ -24,7 +24,7 @@ AIM = 0.95  # of the budget: the model's own spread is then inside of it
 VOXELS_PER_FEATURE = 2.0  # across the smallest extent of an object, for its light not to pass through it
 NEARLY = 0.9  # of what is aimed at: a choice that takes less has nothing more to gain
 SHOWS = 0.005  # of an error: what doubling the rays has to take off it to be worth their time
-MOST = {"gather.rays": 65536, "vpls.further": 4096}
+MOST = {"gather.rays": 65536, "vpls.count": 4096}
 
 
 @dataclass(frozen=True)
