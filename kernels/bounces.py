@@ -16,7 +16,17 @@ from warp_dvct.kernels.bounce_field import (
     wall_side,
 )
 from warp_dvct.kernels.gather import World, radiosity_at
-from warp_dvct.kernels.geometry import FAR, Geometry, Hit, corner_position, trace_real, trace_synthetic
+from warp_dvct.kernels.geometry import (
+    FAR,
+    OFFSET_RELATIVE,
+    Geometry,
+    Hit,
+    corner_position,
+    largest_coordinate,
+    trace_all,
+    trace_real,
+    trace_synthetic,
+)
 from warp_dvct.kernels.materials import Materials, Surface, hemispherical_albedo, spawn_point, surface_at
 from warp_dvct.kernels.sampling import PI, cosine_hemisphere, from_frame, sobol2
 from warp_dvct.kernels.volume import Volume, brick_extent, face_of, face_weight, find_record, key_cell
@@ -129,6 +139,58 @@ class PatchHits:
     triangle: wp.array(dtype=wp.int32)  # [count * rays], -1 where a ray meets nothing
 
 
+@wp.struct
+class Fragments:
+    """The pieces of triangles in each record of level 0."""
+
+    count: wp.int32
+    records: wp.int32
+    record_start: wp.array(dtype=wp.int32)
+    order: wp.array(dtype=wp.int32)
+    triangle: wp.array(dtype=wp.int32)
+    place: wp.array(dtype=wp.vec4)  # position and area
+
+
+@wp.func
+def largest_fragment(geo: Geometry, normals: wp.array(dtype=wp.vec3), pieces: Fragments, record: int, face: int) -> int:
+    """The fragment of a record that shows most on a face."""
+    stop = pieces.count
+    if record + 1 < pieces.records:
+        stop = pieces.record_start[record + 1]
+    chosen = int(-1)
+    most = float(-1.0)
+    for j in range(pieces.record_start[record], stop):
+        fragment = pieces.order[j]
+        triangle = pieces.triangle[fragment]
+        facing = face_weight(normals[triangle], face)
+        if geo.double_sided[triangle] != 0:
+            facing = wp.max(facing, face_weight(-normals[triangle], face))
+        if facing * pieces.place[fragment][3] > most:
+            most = facing * pieces.place[fragment][3]
+            chosen = fragment
+    return chosen
+
+
+@wp.func
+def fragment_normal(normals: wp.array(dtype=wp.vec3), triangle: int, face: int) -> wp.vec3:
+    """The normal of the side that shows on a face."""
+    normal = normals[triangle]
+    return wp.where(face_weight(normal, face) > 0.0, normal, -normal)
+
+
+@wp.func
+def is_buried(
+    geo: Geometry, normals: wp.array(dtype=wp.vec3), position: wp.vec3, normal: wp.vec3, reach: float, near: float
+) -> bool:
+    """Whether a surface point lies in an object, or so close under one that it stands for little but itself."""
+    origin = position + normal * (OFFSET_RELATIVE * reach)
+    hit = trace_all(geo, origin, normal, FAR)
+    if hit.found == 0:
+        return False
+    from_behind = wp.dot(normals[hit.triangle], normal) > 0.0 and geo.double_sided[hit.triangle] == 0
+    return hit.t < near or from_behind
+
+
 @wp.kernel
 def _choose_patches(
     first: int,
@@ -143,20 +205,20 @@ def _choose_patches(
     runs: int,
     area_in: wp.array(dtype=wp.vec2),
     faces: float,
-    record_start_in: wp.array(dtype=wp.int32),
-    order_in: wp.array(dtype=wp.int32),
-    triangle_in: wp.array(dtype=wp.int32),
-    fragment_in: wp.array(dtype=wp.vec4),
-    fragments: int,
-    records: int,
+    pieces: Fragments,
+    near: float,
     patches_out: Patches,
     table_out: wp.array(dtype=wp.int32),
 ):
-    """The largest fragment behind each occupied face becomes its patch; a face covers ``faces`` of level 0."""
+    """The largest fragment behind each occupied face that is not buried becomes its patch.
+
+    A face covers ``faces`` of level 0; what something covers within ``near`` counts as buried.
+    """
     i = first + wp.tid()
     end = entries
     if i + 1 < runs:
         end = start_in[i + 1]
+    face = face_key_in[i] % 6
     best = int(-1)
     most = float(-1.0)
     shown = float(0.0)
@@ -164,29 +226,21 @@ def _choose_patches(
         area = area_in[face_order_in[j]][1]
         shown += area
         if area > most:
-            most = area
-            best = face_order_in[j]
+            fragment = largest_fragment(geo, normal_in, pieces, face_order_in[j] / 6, face)
+            triangle = pieces.triangle[fragment]
+            normal = fragment_normal(normal_in, triangle, face)
+            place = pieces.place[fragment]
+            position = wp.vec3(place[0], place[1], place[2])
+            reach = wp.max(largest_coordinate(position), 1.0)
+            buried = is_buried(geo, normal_in, position, normal, reach, near)
+            if best < 0 or not buried:
+                best = fragment
+            if not buried:
+                most = area
     patches_out.area[i] = shown / faces
-    face = best % 6
-    record = best / 6
-    stop = fragments
-    if record + 1 < records:
-        stop = record_start_in[record + 1]
-    chosen = int(-1)
-    most = float(-1.0)
-    for j in range(record_start_in[record], stop):
-        fragment = order_in[j]
-        normal = normal_in[triangle_in[fragment]]
-        facing = face_weight(normal, face)
-        if geo.double_sided[triangle_in[fragment]] != 0:
-            facing = wp.max(facing, face_weight(-normal, face))
-        if facing * fragment_in[fragment][3] > most:
-            most = facing * fragment_in[fragment][3]
-            chosen = fragment
-    triangle = triangle_in[chosen]
-    normal = normal_in[triangle]
-    normal = wp.where(face_weight(normal, face) > 0.0, normal, -normal)
-    place = fragment_in[chosen]
+    triangle = pieces.triangle[best]
+    normal = fragment_normal(normal_in, triangle, face)
+    place = pieces.place[best]
     s = fragment_surface(geo, mats, triangle, wp.vec3(place[0], place[1], place[2]), -normal)
     patches_out.position[i] = s.position
     patches_out.normal[i] = normal

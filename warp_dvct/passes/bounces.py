@@ -16,6 +16,7 @@ from warp_dvct.kernels.voxelization import EMPTY_KEY
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.voxels import Voxels, count_below, sort_by_key, unique_runs
 
+BURIED = 0.5  # voxels of level 0: a patch that something covers within that distance stands for little but itself
 PATCH_HITS = "patches' real hits"
 
 
@@ -90,7 +91,6 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
     data.real = launcher.zeros(max(1, count), wp.int32)
     data.place = launcher.zeros(max(1, count), wp.int64)
     table = launcher.full(max(1, 6 * voxels.level_records[level]), -1, wp.int32)
-    pieces = voxels.fragments
     launcher.launch(
         kernels._choose_patches,
         count,
@@ -106,12 +106,8 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
             count,
             voxels.area,
             float(4**level),
-            pieces.record_start,
-            pieces.order,
-            pieces.triangle,
-            pieces.place,
-            pieces.count,
-            records,
+            _fragments(voxels),
+            BURIED * voxels.box.voxel,
         ],
         [data, table],
     )
@@ -130,6 +126,19 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
             kernels._wall_of_patches, count, [data, bounce_field(launcher, patches, data.position)], [beside]
         )
     return patches
+
+
+def _fragments(voxels: Voxels) -> Any:
+    """``kernels.Fragments`` of a volume."""
+    pieces, out = voxels.fragments, kernels.Fragments()
+    out.count, out.records = pieces.count, voxels.level_records[0]
+    out.record_start, out.order, out.triangle, out.place = (
+        pieces.record_start,
+        pieces.order,
+        pieces.triangle,
+        pieces.place,
+    )
+    return out
 
 
 def solve_bounces(
