@@ -105,12 +105,16 @@ INSIDE = {
 }
 
 
+FINE = {"volume.resolution": 96, "volume.coarse": 64, "rsm.texels": 256, "patches.count": 4096}
+MAPS = {"ism.size": 128, "ism.points": 1024, "ism.blocks": 16, "vpls.count": 128, "vpls.further": 64}
+
+
 @pytest.mark.parametrize("kind", INSIDE)
-@pytest.mark.parametrize("method", ["rays", "vpl-rays", "path"])
-def test_a_light_inside_of_an_object_is_hidden_by_it(method, kind):
-    """At most 5 % of it leaks, where the ball's lining and the floor that it stands on share voxels."""
-    fine = {"volume.resolution": 96, "volume.coarse": 64, "rsm.texels": 256, "patches.count": 4096}
-    seen = numbers(room(lights=(INSIDE[kind],)), method, **fine)
+@pytest.mark.parametrize(("method", "more"), [("rays", FINE), ("vpl-rays", {}), ("ism", MAPS), ("path", {})])
+def test_a_light_inside_of_an_object_is_hidden_by_it(method, more, kind):
+    """At most 5 % of it leaks, where the ball's lining and the floor that it stands on share voxels, and through
+    shadow maps of the preset's size."""
+    seen = numbers(room(lights=(INSIDE[kind],)), method, **more)
     assert seen.picture.mean() < 0.05 * seen.before.mean()
 
 
@@ -133,7 +137,7 @@ def test_lights_in_odd_places_and_sizes_give_finite_pictures(method, place):
 
 
 @pytest.mark.parametrize("angle", [1e-1, 1e-2, 1e-3, 1e-4])
-@pytest.mark.parametrize("method", ["rays", "vpl-rays", "path"])
+@pytest.mark.parametrize("method", METHODS)
 def test_light_at_grazing_angles_falls_with_the_sine(method, angle):
     """Down to 1e-4 rad, to 0.1 %: the cosine comes from the normal, not from a difference of near numbers."""
     sun = Light(LightKind.DISTANT, (1.0, 1.0, 1.0), direction=(np.cos(angle), -np.sin(angle), 0.0))
