@@ -7,11 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from captures import nearest
+from captures import nearest, real_triangles
 
 from warp_dvct.capture import fusion
 from warp_dvct.capture.frames import FrameList, RgbdFrame, Skipped
-from warp_dvct.capture.fusion import FusionOptions, clean_depth, count_blocks, fuse, open3d_for_reconstruction
+from warp_dvct.capture.fusion import (
+    FusedMesh,
+    FusionOptions,
+    clean_depth,
+    count_blocks,
+    fuse,
+    open3d_for_reconstruction,
+)
+from warp_dvct.capture.irradiance import Lighting, Receivers
 from warp_dvct.capture.source import CaptureFrames
 from warp_dvct.errors import DeviceError, FileError, OptionError
 
@@ -88,6 +96,49 @@ def test_a_floater_is_dropped_and_would_otherwise_be_there(frames, room):
     # Frames that look through it take it away.
     several = FrameList([*dirty.frames, *frames.frames[3:6], *frames.frames[7:10]])
     assert nearest(room, fuse(several, replace(COARSE, least_area=0.0)).points)[0].max() < 0.1
+
+
+def test_no_floater_casts_a_shadow(noisy_capture, room, launcher):
+    """Light of the lamp on the true surface, 3 cm above it: where it arrives in the true room it does in the scan.
+
+    Beside things of which the scan knows only the front, the scan is lighter, never darker.
+    """
+    mesh = fuse(CaptureFrames(noisy_capture), replace(COARSE, voxel=0.02))
+    points, triangles, _ = real_triangles(room)
+    corners = points[triangles]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=-1)
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(area), 20000, p=area / area.sum())
+    share = rng.dirichlet(np.ones(3), 20000)
+    at = (corners[chosen] * share[..., None]).sum(1)
+    normal = cross[chosen] / area[chosen][:, None]
+    o3d = open3d_for_reconstruction(2)
+    cast = o3d.t.geometry.RaycastingScene()
+    cast.add_triangles(o3d.core.Tensor(mesh.points), o3d.core.Tensor(mesh.triangles.astype(np.uint32)))
+    seen = cast.compute_distance(o3d.core.Tensor(at.astype(np.float32))).numpy() < 0.02
+    receivers = Receivers(at[seen], normal[seen], 0.03)
+    white = FusedMesh(points.astype(np.float32), np.zeros_like(points), None, triangles.astype(np.int32), {}, 1, 1, 0)
+    hanging = np.array([[-0.15, 0.5, -0.3], [0.15, 0.5, -0.3], [0.0, 0.5, 0.0]], np.float32)
+    floater = FusedMesh(
+        np.concatenate([mesh.points, hanging]),
+        np.concatenate([mesh.normals, np.zeros((3, 3), np.float32)]),
+        None,
+        np.concatenate([mesh.triangles, len(mesh.points) + np.array([[0, 2, 1]], np.int32)]),
+        {},
+        1,
+        1,
+        0,
+    )
+    true, ours, shadowed = (
+        Lighting(launcher, m, np.full((len(m.points), 3), 0.5), room.lights).direct(receivers)[:, 0]
+        for m in (white, mesh, floater)
+    )
+    lit = true > 0.2 * np.median(true)
+    assert lit.sum() > 3000
+    assert (ours < 0.8 * true)[lit].mean() < 0.003
+    assert np.median(ours[lit] / true[lit]) == pytest.approx(1.0, abs=0.01)
+    assert (shadowed < 0.8 * true)[lit].mean() > 0.01  # one of 30 cm would be found
 
 
 def test_pixels_at_a_jump_of_depth_are_left_out():

@@ -76,6 +76,7 @@ def test_the_bunny_stands_in_the_photograph(shot, method):
     far = real & (distance > 6.0 * HEIGHT)
     change = np.abs(layers.comp - layers.plate).reshape(-1, 3).max(-1)
     assert change[far].mean() < 0.01
+    assert np.percentile(change[far], 95) < 0.01
 
     untouched = (layers.delta == 0).all(-1) & (layers.mask_synthetic == 0)
     assert untouched.any()
