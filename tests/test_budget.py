@@ -14,6 +14,7 @@ from warp_dvct.accuracy import LADDERS, STRIDE, load_accuracy
 from warp_dvct.budget import Choice, choose
 from warp_dvct.calibrate import calibrate, subdivide
 from warp_dvct.cost import (
+    FIRST_RAYS,
     CostModel,
     Sample,
     count_work,
@@ -85,7 +86,8 @@ def test_counts_follow_their_settings(surveys):
 
     base = counted(gather__rays=64, gather__object_rays=64, rsm__texels=64, volume__coarse=0, bounces=5)
     twice = counted(gather__rays=128, gather__object_rays=128, rsm__texels=64)["gather"]
-    assert twice["rays"] == pytest.approx(2 * base["gather"]["rays"])
+    more = FIRST_RAYS * math.sqrt(64), FIRST_RAYS * math.sqrt(128)
+    assert twice["rays"] == pytest.approx(base["gather"]["rays"] * (128 + more[1]) / (64 + more[0]))
     assert twice["gathered"] == pytest.approx(base["gather"]["gathered"])
     assert counted(rsm__texels=128, volume__coarse=0)["rsm"]["texels"] == pytest.approx(4 * base["rsm"]["texels"])
     fine = counted(volume__resolution=256, volume__coarse=0)["voxelize"]["records"]
@@ -103,15 +105,15 @@ def test_counts_follow_their_settings(surveys):
 
 
 @pytest.fixture
-def counted_gathers(monkeypatch) -> list[int]:
-    """How many points each gather takes, filled while pictures are rendered."""
+def counted_gathers(monkeypatch) -> list[float]:
+    """How many rays each gather traces, a point's first ones counted as what they cost; rendering fills it."""
     from warp_dvct.passes import gather
 
-    found: list[int] = []
+    found: list[float] = []
     run = gather.Gatherer.run
 
     def counting(self, launcher, points, index, count, *args, **kwargs):
-        found.append(int((index.numpy()[:count] >= 0).sum()) * self.rays)
+        found.append(int((index.numpy()[:count] >= 0).sum()) * (self.rays + FIRST_RAYS * math.sqrt(self.rays)))
         return run(self, launcher, points, index, count, *args, **kwargs)
 
     monkeypatch.setattr(gather.Gatherer, "run", counting)
