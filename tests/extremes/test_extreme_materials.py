@@ -82,8 +82,8 @@ def test_energy_never_grows_between_white_walls(method):
 
 @pytest.mark.parametrize("method", ["rays", "cones"])
 def test_white_walls_lose_nothing(method):
-    """Albedo 1 in a closed room with objects in it: the 21st to the 50th bounce bring what the 6th to the 20th do, each,
-    within 3 %. Patches under and in objects, which stood for the floor around them, took 1 % of it at every bounce."""
+    """Albedo 1 in a closed room with objects in it: each of the 21st to the 50th bounce brings what each of the 6th to
+    the 20th does, to 3 %. Patches under and in objects, which stood for the floor around them, took 1 % every time."""
     white = (Material(base_color=(1.0, 1.0, 1.0), ior=1.0),) * 3
     some, more, most = (numbers(room(materials=white), method, bounces=n).picture.mean() for n in (5, 20, 50))
     assert (most - more) / 30 == pytest.approx((more - some) / 15, rel=0.03)
