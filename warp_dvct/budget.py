@@ -8,7 +8,7 @@ squared error for its time is taken, again and again, until the time is used up 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -173,7 +173,7 @@ class _Chooser:
                 f" {self.height} takes about {floor:.2f} s on {self.threads} thread(s); raise it or lower --imageWidth"
             )
         aim = math.inf if budget is None else max(AIM * budget, floor)
-        state, stopped = self._climb(state, aim, max_error)
+        state, last, stopped = self._climb(state, aim, max_error)
         if max_error is not None and math.sqrt(self.square(self.settings(state))) > max_error:
             least = math.sqrt(self.square(self.settings(state)))
             raise OptionError(
@@ -181,19 +181,23 @@ class _Chooser:
                 " --method path-trace has no such limit"
             )
         enough = False
+        if max_error is not None:
+            state = self._cheapest([state, last], max_error)
         if budget is not None:
             state, enough = self._fill(state, aim)
             stopped = "more would not show" if enough else "the time is used up"
         return self._choice(state, floor, stopped, enough=enough)
 
-    def _climb(self, state: dict[str, float], aim: float, max_error: float | None) -> tuple[dict[str, float], str]:
-        """Take steps while they fit; returns the state and why it ended."""
-        state = dict(state)
+    def _climb(
+        self, state: dict[str, float], aim: float, max_error: float | None
+    ) -> tuple[dict[str, float], dict[str, float], str]:
+        """Take steps while they fit; returns the state, the one before, and why it ended."""
+        state = last = dict(state)
         while True:
             settings = self.settings(state)
             time, square = self.seconds(settings), self.square(settings)
             if max_error is not None and square <= max_error**2:
-                return state, "the error is reached"
+                return state, last, "the error is reached"
             best, gain, full = None, 0.0, False
             for ladder in self.ladders:
                 for value in ladder.values[ladder.values.index(state[ladder.knob]) + 1 :]:
@@ -208,8 +212,28 @@ class _Chooser:
                     if less / max(more, 1e-6) > gain:
                         best, gain = candidate, less / max(more, 1e-6)
             if best is None:
-                return state, "the time is used up" if full else "nothing more that the table knows would help"
-            state = best
+                return state, last, "the time is used up" if full else "nothing more that the table knows would help"
+            state, last = best, state
+
+    def _cheapest(self, states: Sequence[dict[str, float]], max_error: float) -> dict[str, float]:
+        """Of some states the one that keeps an error in the least time, with as many rays or virtual lights as that
+        takes: a whole step often does more than was asked for."""
+
+        def keeps(state: Mapping[str, float]) -> bool:
+            return self.square(self.settings(state)) <= max_error**2
+
+        found = []
+        for state in states:
+            knob = FILLED[self.method]
+            if knob in state:
+                low, high = int(next(x for x in self.ladders if x.knob == knob).values[0]), MOST[knob]
+                while low < high:
+                    middle = (low + high) // 2
+                    low, high = (low, middle) if keeps({**state, knob: middle}) else (middle + 1, high)
+                state = {**state, knob: low}
+            if keeps(state):
+                found.append(state)
+        return min(found, key=lambda state: self.seconds(self.settings(state)))
 
     def _fill(self, state: dict[str, float], aim: float) -> tuple[dict[str, float], bool]:
         """What is left of the time goes into rays or virtual lights, which never harm, as long as twice as many take
