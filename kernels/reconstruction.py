@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_dvct.kernels.gbuffer import Points
+from warp_dvct.kernels.gbuffer import BACKGROUND, Points
 from warp_dvct.kernels.sampling import uniform1
 
 wp.set_module_options({"enable_backward": False})
@@ -219,12 +219,16 @@ def _reconstruct(
     after_out: wp.array(dtype=wp.vec3),
     missing_out: wp.array(dtype=wp.int32),
 ):
-    """Irradiance of every point of a role from the gathered ones around, weighted by distance, plane and normal.
+    """Irradiance of every point of a role from the gathered ones around, weighted by distance, plane and normal; 0 at
+    the background.
 
     ``missing_out`` is 1 where none of them lies on the same surface.
     """
     i = first + wp.tid()
     missing = int(0)
+    if points.role[i] == BACKGROUND:
+        before_out[i] = wp.vec3(0.0, 0.0, 0.0)
+        after_out[i] = wp.vec3(0.0, 0.0, 0.0)
     if points.role[i] == role:
         found = interpolated(points, i, width, guide, choice_in, before_in, after_in)
         missing = found.missing
@@ -283,17 +287,3 @@ def _scatter_missing(
 def _mark_role(first: int, points: Points, role: int, mark_out: wp.array(dtype=wp.int32)):
     i = first + wp.tid()
     mark_out[i] = wp.where(points.role[i] == role, 1, 0)
-
-
-@wp.kernel
-def _merge(
-    first: int,
-    before_in: wp.array(dtype=wp.vec3),
-    after_in: wp.array(dtype=wp.vec3),
-    before_out: wp.array(dtype=wp.vec3),
-    after_out: wp.array(dtype=wp.vec3),
-):
-    """Join two sets of irradiance, each zero at the points of the other."""
-    i = first + wp.tid()
-    before_out[i] += before_in[i]
-    after_out[i] += after_in[i]

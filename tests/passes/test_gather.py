@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 from warp_dvct.launch import Launcher
-from warp_dvct.passes.gather import Gatherer, gather_all, gather_sparse, merge, shade_indirect
+from warp_dvct.passes.gather import Gatherer, gather_all, gather_sparse, shade_indirect
 from warp_dvct.passes.gbuffer import render_gbuffer
 from warp_dvct.scene import Light, LightKind, LightRole, Role
 
@@ -48,14 +48,17 @@ def seen(launcher, scene, width=75, height=61, samples=4):
 
 
 def sparse(launcher, buffer, gatherer, role=Role.REAL, *, stride=4, radius=2, smoothing=2):
-    before, after = gather_sparse(launcher, buffer, role, gatherer, stride=stride, radius=radius, smoothing=smoothing)
+    """What is written for a role, and -1 where nothing is."""
+    before, after = (launcher.full(buffer.count, wp.vec3(-1.0, -1.0, -1.0), wp.vec3) for _ in range(2))
+    gather_sparse(launcher, buffer, role, gatherer, (before, after), stride=stride, radius=radius, smoothing=smoothing)
     return before.numpy()[: buffer.count].astype(float), after.numpy()[: buffer.count].astype(float)
 
 
 @pytest.mark.parametrize("role", [Role.REAL, Role.SYNTHETIC])
 @pytest.mark.parametrize("stride", [1, 2, 4, 7])
 def test_a_constant_field_comes_back_and_every_point_is_filled(launcher, stride, role):
-    """Also at the edge points, and in pixel counts that the stride does not divide; the other role gets 0."""
+    """Also at the edge points, and in pixel counts that the stride does not divide; the other role is left alone, and
+    the background gets 0."""
     buffer = seen(launcher, box_scene(20.0))
     assert buffer.count > 75 * 61
     mine = buffer.points.role.numpy()[: buffer.count] == role
@@ -63,8 +66,12 @@ def test_a_constant_field_comes_back_and_every_point_is_filled(launcher, stride,
     before, after = sparse(launcher, buffer, Painted(lambda p, n: np.ones(len(p))), role, stride=stride)
     np.testing.assert_allclose(before[mine], np.broadcast_to([1.0, 2.0, 4.0], (mine.sum(), 3)), rtol=1e-5)
     np.testing.assert_allclose(after[mine], np.broadcast_to([2.0, 3.0, 5.0], (mine.sum(), 3)), rtol=1e-5)
-    assert not before[~mine].any()
-    assert not after[~mine].any()
+    background = buffer.points.role.numpy()[: buffer.count] == -1
+    other = ~mine & ~background
+    assert other.any()
+    for irradiance in (before, after):
+        assert (irradiance[other] == -1.0).all()
+        assert not irradiance[background].any()
 
 
 def surface_of(places, normals) -> np.ndarray:
@@ -148,8 +155,9 @@ def test_furnace_through_the_sparse_path(launcher, cones):
     gatherer = Gatherer(world.device_scene, world.world, 32, 0, cones, lit.cone_settings() if cones else None)
     before, after = (np.zeros((buffer.count, 3)) for _ in range(2))
     for role in (Role.REAL, Role.SYNTHETIC):
-        b, a = sparse(launcher, buffer, gatherer, role)
-        before, after = before + b, after + a
+        found = sparse(launcher, buffer, gatherer, role)
+        mine = (buffer.points.role.numpy()[: buffer.count] == role)[:, None]
+        before, after = (np.where(mine, new, old) for new, old in zip(found, (before, after), strict=True))
     np.testing.assert_allclose(after, np.broadcast_to([1.0, 2.0, 3.0], after.shape), rtol=2e-3)
     real = buffer.points.role.numpy()[: buffer.count] == 0
     np.testing.assert_allclose(before[real], np.broadcast_to([1.0, 2.0, 3.0], before[real].shape), rtol=2e-3)
@@ -242,14 +250,6 @@ def test_shade_indirect_reflects_irradiance(launcher):
     np.testing.assert_allclose(
         radiance.numpy(), np.array([before[0] * color / np.pi, [0] * 3, [0] * 3]) + 0.25, rtol=1e-5
     )
-
-
-def test_merge_adds(launcher):
-    values = np.random.default_rng(0).random((4, 300, 3))
-    arrays = [lit.launcher_vectors(launcher, v) for v in values]
-    merge(launcher, (arrays[0], arrays[1]), (arrays[2], arrays[3]))
-    np.testing.assert_allclose(arrays[0].numpy(), values[0] + values[2], rtol=1e-6)
-    np.testing.assert_allclose(arrays[1].numpy(), values[1] + values[3], rtol=1e-6)
 
 
 def test_a_seed_decides_and_threads_do_not(launcher):

@@ -30,7 +30,6 @@ from warp_dvct.passes.gather import (
     gather_sparse,
     glossy_hits,
     keep_rays,
-    merge,
     shade_indirect,
 )
 from warp_dvct.passes.gbuffer import GBuffer, render_gbuffer, see_real
@@ -134,10 +133,12 @@ def render(
             seed=settings.seed,
             real=real,
         )
-    light = launcher.zeros(buffer.count, wp.vec3)
+    shaded = plan.changes or with_before
+    # The direct pass writes every point.
+    light = (launcher.empty if shaded else launcher.zeros)(buffer.count, wp.vec3)
     before = launcher.zeros(buffer.count if with_before else 1, wp.vec3)
     hidden_before = launcher.zeros(max(1, buffer.behind_count), wp.vec3)
-    if plan.changes or with_before:
+    if shaded:
         rays = _kept_rays(launcher, scene, plan, kept) if _has_indirect(scene, plan) else None
         hits = glossy_hits(launcher, scene, device_scene, light_field.bounces, settings.seed)
         parts = [_Part(buffer.points, buffer.count, light, before, with_before)]
@@ -377,31 +378,21 @@ def _irradiance(
         fewer = Gatherer(scene, world, max(1, settings.gather_rays // 4), *shared)
         return gather_all(launcher, part.points, part.count, fewer)
     synthetic = Gatherer(scene, world, settings.gather_object_rays, *shared)
-    before, after = gather_sparse(
-        launcher,
-        buffer,
-        Role.REAL,
-        real,
-        stride=settings.gather_stride,
-        radius=settings.gather_radius,
-        smoothing=settings.gather_smoothing,
-        detail=settings.gather_detail,
-        change=0.0 if part.with_before else settings.gather_change,
-        kept=rays,
+    irradiance = launcher.empty(part.count, wp.vec3), launcher.empty(part.count, wp.vec3)
+    how = {
+        "radius": settings.gather_radius,
+        "smoothing": settings.gather_smoothing,
+        "detail": settings.gather_detail,
+    }
+    change = 0.0 if part.with_before else settings.gather_change
+    gather_sparse(
+        launcher, buffer, Role.REAL, real, irradiance, stride=settings.gather_stride, change=change, kept=rays, **how
     )
     if scene.synthetic is not None:
-        object_before, object_after = gather_sparse(
-            launcher,
-            buffer,
-            Role.SYNTHETIC,
-            synthetic,
-            stride=settings.gather_object_stride,
-            radius=settings.gather_radius,
-            smoothing=settings.gather_smoothing,
-            detail=settings.gather_detail,
+        gather_sparse(
+            launcher, buffer, Role.SYNTHETIC, synthetic, irradiance, stride=settings.gather_object_stride, **how
         )
-        merge(launcher, (before, after), (object_before, object_after))
-    return before, after
+    return irradiance
 
 
 def _shade_specular(launcher: Launcher, scene: DeviceScene, plan: Plan, light_field: LightField, part: _Part) -> None:

@@ -136,6 +136,7 @@ def gather_sparse(
     buffer: GBuffer,
     role: Role,
     gatherer: Gatherer,
+    irradiance: tuple[Any, Any],
     *,
     stride: int,
     radius: int,
@@ -143,22 +144,20 @@ def gather_sparse(
     detail: float = 0.0,
     change: float = 0.0,
     kept: Any = None,
-) -> tuple[Any, Any]:
-    """Irradiance, before and after, at every shading point of a role.
+) -> None:
+    """Write irradiance, before and after, at every shading point of a role, and 0 at the background.
 
     One pixel of each ``stride`` x ``stride`` block is gathered; ``smoothing`` a-trous steps average the gathered values
     as far as the distance to what they see allows; the others are reconstructed from the blocks within
     ``radius`` that lie on the same surface. Points without any such block are gathered themselves.
 
     Args:
+        irradiance: Where to: two vec3 ``[buffer.count]``.
         detail: Bound on the relative change of irradiance within a block (Ward et al. 1988) beyond which it is gathered
             at half the stride; 0 for never.
         change: Least change around a block, as a share of irradiance, for that; 0 for any. For pictures of which only
             the change is used.
         kept: ``KeptRays`` with a slot per block, for the role REAL.
-
-    Returns:
-        Two vec3 ``[buffer.count]``; 0 at points of the other role.
     """
     columns, rows = -(-buffer.width // stride), -(-buffer.height // stride)
     choice = _choose(launcher, buffer, stride, columns, rows, role, gatherer.seed)
@@ -169,20 +168,17 @@ def gather_sparse(
     grid = _smooth(launcher, buffer, grid, launcher.full(grid.count, 1, wp.int32), steps)
     while detail > 0.0 and grid.stride > FINEST and grid.stride % 2 == 0 and gatherer.cone is None:
         grid = _refine(launcher, buffer, role, gatherer, grid, radius, steps, detail, change)
-    before = launcher.zeros(buffer.count, wp.vec3)
-    after = launcher.zeros(buffer.count, wp.vec3)
     missing = launcher.empty(buffer.count, wp.int32)
     guide = grid.guide(radius if grid.stride > 1 else min(radius, 1))
     launcher.launch(
         reconstruction._reconstruct,
         buffer.count,
         [buffer.points, buffer.width, int(role), guide, grid.choice, grid.before, grid.after],
-        [before, after, missing],
+        [*irradiance, missing],
     )
     _, index, left = compact(launcher, missing)
-    left_before, left_after = gatherer.run(launcher, buffer.points, index, left)
-    launcher.launch(reconstruction._scatter_missing, left, [index, left_before, left_after], [before, after])
-    return before, after
+    found = gatherer.run(launcher, buffer.points, index, left)
+    launcher.launch(reconstruction._scatter_missing, left, [index, *found], [*irradiance])
 
 
 def _choose(launcher: Launcher, buffer: GBuffer, stride: int, columns: int, rows: int, role: Role, seed: int) -> Any:
@@ -268,8 +264,3 @@ def shade_indirect(
 ) -> None:
     """Add diffusely reflected irradiance to ``light`` (and ``before``): Franke 2014, eqs. 6 and 8, first terms."""
     launcher.launch(kernels._shade_indirect, count, [points, *irradiance, alpha_max, int(with_before)], [light, before])
-
-
-def merge(launcher: Launcher, into: tuple[Any, Any], other: tuple[Any, Any]) -> None:
-    """Add irradiance gathered for one role to that of the other; each is 0 at the points of the other."""
-    launcher.launch(reconstruction._merge, into[0].shape[0], [*other], [*into])
