@@ -218,3 +218,30 @@ def test_tum_sample(tmp_path):
     assert (done.format, done.frames, done.colored) == ("pair", 1, 1)
     assert 1.0 < done.median_depth < 4.0
     assert capture.color(0).shape == (480, 640, 3)
+
+
+@pytest.mark.parametrize(("depth", "color"), [("1", None), (None, "1"), ("0", "1")])
+def test_poses_stay_with_their_frames_where_images_are_missing(tmp_path, depth, color):
+    folder = data.redwood(tmp_path / "scan")
+    for kind, name in (("depth", depth), ("color", color)):
+        if name is not None:
+            (folder / kind / f"{name}.png").unlink()
+    done, capture = imported(folder, tmp_path)
+    left = [k for k in range(data.COUNT) if str(k) not in (depth, color)]
+    assert done.frames == len(left)
+    assert sum(f"{name}.png" in note for note in done.notes for name in (depth, color) if name) >= 1
+    for number, k in enumerate(left):
+        np.testing.assert_allclose(capture.pose(number)[:3, 3], data.pose(k)[:3, 3], atol=1e-5)
+        assert capture.depth_file(number).endswith(f"{k}.png")
+
+
+def test_another_number_of_poses_than_of_frames(tmp_path):
+    folder = data.redwood(tmp_path / "scan")
+    for kind in ("depth", "color"):
+        (folder / kind / "0.png").unlink()
+    _, capture = imported(folder, tmp_path)
+    np.testing.assert_allclose(capture.pose(0)[:3, 3], data.pose(1)[:3, 3], atol=1e-5)
+    for kind in ("depth", "color"):
+        (folder / kind / "1.png").rename(folder / kind / "77.png")
+    with pytest.raises(FileError, match="has 3 poses for 2 frames"):
+        imported(folder, tmp_path)

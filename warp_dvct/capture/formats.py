@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -85,19 +85,23 @@ def read_redwood(folder: Path) -> Dataset:
     if not depth:
         raise FileError(f"'{folder / 'depth'}' holds no images; the capture is empty")
     notes: list[str] = []
-    if color and len(color) != len(depth):
+    frames_of = [file.stem for file in depth]
+    shared = {file.stem for file in depth} & {file.stem for file in color}
+    if color and len(shared) < len(depth) + len(color) - len(shared) and (shared or len(color) != len(depth)):
         pairs, lost = _by_stem(depth, color)
-        notes.append(f"{lost} depth images have no photograph of the same name and are left out")
+        names = ", ".join(file.name for file in lost[:5]) + (" …" if len(lost) > 5 else "")
+        notes.append(f"{len(lost)} images have no partner of the same name and are left out: {names}")
+        frames_of = [file.stem for file in _in_order({file.stem: file for file in (*depth, *color)}.values())]
     else:
         pairs = list(zip(depth, color or [None] * len(depth), strict=True))
     trajectory = next((f for f in (folder / "trajectory.log", folder / "odometry.log") if f.is_file()), None)
     poses = _read_trajectory(trajectory) if trajectory else {}
     if not trajectory:
         notes.append("there is no trajectory.log: no pose is known")
+    places = _pose_indices(frames_of, poses, str(trajectory))
     frames = []
     for number, (one, other) in enumerate(pairs):
-        index = depth.index(one)
-        frames.append(_frame(one, other, poses.get(index), notes, number, bool(poses)))
+        frames.append(_frame(one, other, poses.get(places[one.stem]), notes, number, bool(poses)))
     size = image_size(str(frames[0].depth), "depth")
     file = folder / "camera_intrinsic.json"
     lens = read_intrinsics(file, size) if file.is_file() else _default_lens(PRIMESENSE, size)
@@ -285,24 +289,51 @@ def _frame(
 
 
 def _images(folder: Path) -> list[Path]:
-    """Images in the order of the numbers in their names, so that 10.png follows 9.png."""
+    """A folder's images in the order of the numbers in their names."""
+    return _in_order(f for f in folder.iterdir() if f.suffix.lower() in IMAGES) if folder.is_dir() else []
+
+
+def _in_order(files: Iterable[Path]) -> list[Path]:
+    """By the numbers in their names, so that 10.png follows 9.png."""
 
     def key(file: Path) -> list:
-        return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", file.name)]
+        return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", file.stem)]
 
-    found = [f for f in folder.iterdir() if f.suffix.lower() in IMAGES] if folder.is_dir() else []
-    return sorted(found, key=key)
+    return sorted(files, key=key)
 
 
-def _by_stem(depth: list[Path], color: list[Path]) -> tuple[list[tuple[Path, Path]], int]:
-    photos = {file.stem: file for file in color}
+def _by_stem(depth: list[Path], color: list[Path]) -> tuple[list[tuple[Path, Path]], list[Path]]:
+    """Depth images and photographs of one name, and the images that have no partner."""
+    photos, images = {file.stem: file for file in color}, {file.stem for file in depth}
     pairs = [(file, photos[file.stem]) for file in depth if file.stem in photos]
     if not pairs:
         raise FileError(
             f"{len(depth)} depth images and {len(color)} photographs in '{depth[0].parent.parent}', and none have the"
             " same name; which belong together?"
         )
-    return pairs, len(depth) - len(pairs)
+    alone = [file for file in depth if file.stem not in photos] + [file for file in color if file.stem not in images]
+    return pairs, alone
+
+
+def _pose_indices(stems: list[str], poses: dict[int, np.ndarray], file: str) -> dict[str, int]:
+    """Index in a trajectory of each frame's name: its place among all frames, or its number where frames are missing.
+
+    Raises:
+        FileError: There are other numbers of frames and poses, and names do not tell which belong together.
+    """
+    places = {stem: k for k, stem in enumerate(stems)}
+    if not poses or len(poses) == len(stems):
+        return places
+    numbers = [re.findall(r"\d+", stem) for stem in stems]
+    if all(numbers):
+        for first in (0, 1):
+            named = {stem: int(n[-1]) - first for stem, n in zip(stems, numbers, strict=True)}
+            if all(index in poses for index in named.values()):
+                return named
+    raise FileError(
+        f"'{file}' has {len(poses)} poses for {len(stems)} frames, and the numbers in their names are not its indices;"
+        " which belong together? Give each frame its pose, or none"
+    )
 
 
 def _pair(folder: Path) -> tuple[list[Path], list[Path]]:

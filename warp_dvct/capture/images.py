@@ -111,7 +111,7 @@ def _pixels(source: Any, file: str, what: str, kind: str) -> np.ndarray:
     pixels = source.read_image(0, 0, 0, source.spec().nchannels, kind)
     error = source.geterror()
     if pixels is None or error:
-        raise FileError(f"{what} '{file}' is damaged ({error.strip() or 'truncated'}); copy it again")
+        raise FileError(f"{what} '{file}' is damaged ({error.split(chr(10))[0].strip() or 'truncated'}); copy it again")
     return pixels
 
 

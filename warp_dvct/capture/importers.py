@@ -112,6 +112,8 @@ def import_capture(
             f"'{folder}': the median depth is {median:.3g} m with {data.unit:g} m per step, which no depth camera"
             " sees in a room; give --depth-unit (0.001 for mm, 0.0002 for TUM), the same one to insist"
         )
+    if not NEAREST <= median <= FARTHEST:
+        data.notes.append(f"the median depth is {median:.3g} m: is --depth-unit {data.unit:g} right? (0.001 is mm)")
     up = options.up
     if up == "auto":
         up = "y" if data.format == "points" else _find_up(frames)  # a stage says what is up
