@@ -255,7 +255,7 @@ def _measure_shot(scene: Scene, frames: int, options: ScalingOptions) -> dict[st
     plate = np.full((relighter.height, relighter.width, 3), 0.5, np.float32)
     wall = cpu = 0.0
     peak = again = 0
-    places = set()  # of the volumes' box, which follows the object in steps: each needs its own voxels
+    places, last = 0, None  # of the volumes' box, which follows the object in steps: each stay needs its own voxels
     for moment in moments:
         relighter.set_scene(moment)
         relighter.render(plate)
@@ -264,7 +264,8 @@ def _measure_shot(scene: Scene, frames: int, options: ScalingOptions) -> dict[st
         peak = max(peak, stats["peak_bytes"])
         fragments = [reused for name, reused in stats["kept"].items() if name.startswith("real fragments")]
         again += sum(not reused for reused in fragments)
-        places.add((relighter.plan.origin, relighter.plan.scale))
+        place = relighter.plan.origin, relighter.plan.scale
+        places, last = places + (place != last), place
     volumes = 1 + (relighter.plan.coarse is not None)
     return {
         "triangles": sum(len(m.triangles) for m in scene.meshes),
@@ -275,7 +276,7 @@ def _measure_shot(scene: Scene, frames: int, options: ScalingOptions) -> dict[st
         "cpu_passes": {},
         "voxelised_real": again,
         "volumes": volumes,
-        "places": len(places),
+        "places": places,
     }
 
 
