@@ -148,6 +148,11 @@ class LiveSource:
         )
         kept = tuple(mesh for mesh in scene.meshes if mesh.role == Role.SYNTHETIC)
         clouds = tuple(cloud for cloud in scene.point_clouds if cloud.role == Role.SYNTHETIC)
+        if not kept and not clouds and all(light.role == LightRole.PLATE for light in scene.lights):
+            raise StageError(
+                f"'{self._stage}' has nothing synthetic to put into the capture; place an object with"
+                " `warp-dvct capture place`, or tag prims as docs/usage.md says"
+            )
         grid = self._grid(filtered)
         known = bool(_plate_lights(scene.lights))
         factor = self._fitted(known) if fit and color is not None else self._trial

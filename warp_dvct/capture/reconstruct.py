@@ -12,7 +12,7 @@ import numpy as np
 from warp_dvct.capture.enclosure import Enclosure, find_enclosure
 from warp_dvct.capture.frames import FrameSource, Skipped
 from warp_dvct.capture.fusion import FusedMesh, FusionOptions, fuse
-from warp_dvct.capture.scene_stage import SceneLights, write_scene
+from warp_dvct.capture.scene_stage import SceneLights, refuse_overwriting, write_scene
 from warp_dvct.capture.stage import Capture
 from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher
@@ -94,6 +94,7 @@ def reconstruct(
         FileError, OptionError, StageError, DeviceError: As the steps say.
     """
     report = progress or (lambda name, share: None)
+    _check_files(capture, output, options)
     mesh = fuse(
         source,
         options.fusion,
@@ -126,6 +127,15 @@ def reconstruct(
         facts={"voxel": options.fusion.voxel, "albedo": options.albedo if authored else "color"},
     )
     return Reconstruction(mesh, notes)
+
+
+def _check_files(capture: Capture, output: str | Path, options: ReconstructOptions) -> None:
+    """Say at once what would fail after the work."""
+    from warp_dvct.usd.stage import open_stage
+
+    refuse_overwriting(capture, output)
+    if options.probe is not None:
+        open_stage(options.probe)
 
 
 def _find_light(

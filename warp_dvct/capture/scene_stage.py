@@ -58,6 +58,16 @@ def lights_file(target: Path) -> Path:
     return target.with_name(f"{target.stem}_lights.usda")
 
 
+def refuse_overwriting(capture: Capture, path: str | Path) -> None:
+    """A scene lies over its capture, which stays as it is.
+
+    Raises:
+        OptionError: ``path`` is the capture.
+    """
+    if os.path.realpath(path) == os.path.realpath(capture.path):
+        raise OptionError(f"the scene '{path}' would overwrite the capture that it is made of; give another name")
+
+
 def write_scene(
     path: str | Path,
     capture: Capture,
@@ -84,8 +94,7 @@ def write_scene(
         OptionError: The scene would overwrite its capture. FileError: A file cannot be written.
     """
     target = Path(os.path.abspath(path))
-    if target == Path(os.path.abspath(capture.path)):
-        raise OptionError(f"the scene '{path}' would overwrite the capture that it is made of; give another name")
+    refuse_overwriting(capture, path)
     root = Path(str(capture.depth_path)).parent.as_posix()
     if root == "/":
         raise StageError(f"{capture.depth_path} of '{capture.path}' has no prim above it; put it below an Xform")
