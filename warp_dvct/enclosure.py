@@ -23,10 +23,11 @@ def within_enclosure(scene: Scene) -> Scene:
 
     They do where every corner of the near plane (the eye, where it is at 0) has a winding number other than 0 and a
     whole one, as inside of closed meshes, whichever way they face. Scans with holes do not. Triangles inside of the
-    bounds stay as they are; others are cut, and their attributes interpolated.
+    bounds stay as they are; others are cut, and their attributes interpolated. What a depth camera saw of one frame
+    encloses nothing.
     """
-    real, synthetic = scene.bounds(Role.REAL), scene.bounds(Role.SYNTHETIC)
-    if real is None or synthetic is None:
+    real, synthetic = (_bounds_of_points(scene, role) for role in (Role.REAL, Role.SYNTHETIC))
+    if real is None or synthetic is None or scene.captured:
         return scene
     margin = MARGIN * float(np.max(real[1] - real[0]))
     low, high = real[0] - margin, real[1] + margin
@@ -51,6 +52,15 @@ def within_enclosure(scene: Scene) -> Scene:
         meshes=tuple(m for m in meshes if len(m.triangles)),
         point_clouds=tuple(c for c in clouds if len(c.points)),
     )
+
+
+def _bounds_of_points(scene: Scene, role: Role) -> tuple[np.ndarray, np.ndarray] | None:
+    """Bounds of all points of a role's meshes, whether or not a triangle uses them: this runs for every frame."""
+    points = [m.points for m in scene.meshes if m.role == role and len(m.triangles)]
+    if not points:
+        return None
+    low = np.array([min(p[:, k].min() for p in points) for k in range(3)])
+    return low, np.array([max(p[:, k].max() for p in points) for k in range(3)])
 
 
 def _encloses(scene: Scene, low: np.ndarray, high: np.ndarray) -> bool:
