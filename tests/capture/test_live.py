@@ -11,12 +11,14 @@ import pytest
 from click.testing import CliRunner
 
 from warp_dvct.capture.importers import ImportOptions, import_capture
+from warp_dvct.capture.intrinsics import undistort
 from warp_dvct.capture.live import LiveOptions, LiveSource
+from warp_dvct.capture.registration import sample
 from warp_dvct.capture.simulate import Simulation, simulate
 from warp_dvct.capture.stage import FrameFiles, open_capture, write_capture
 from warp_dvct.cli import cli
 from warp_dvct.errors import OptionError, StageError
-from warp_dvct.image import read_plate
+from warp_dvct.image import read_plate, write_png
 from warp_dvct.metrics import flip_ldr
 from warp_dvct.relighter import Relighter
 from warp_dvct.scene import LightKind, Role
@@ -176,6 +178,27 @@ def test_the_command_relights_frame_by_frame(tmp_path, capture):
     wrong = CliRunner().invoke(cli, [*arguments, "--camera", "/World/Camera"])
     assert wrong.exit_code == 2
     assert "--camera does not go with --real-from" in wrong.output
+
+
+def test_depth_jumps_are_moved_to_the_edges_of_a_photograph_that_its_lens_bends(tmp_path, capture, launcher):
+    """The same photograph through a lens that bends guides as through one that does not; so is the filtered depth."""
+    opened = open_capture(capture.capture)
+    straight = opened.rig.color
+    bent = replace(straight, distortion=(-0.2, 0.05, 0.0, 0.0, 0.0))
+    y, x = np.indices((bent.height, bent.width)).astype(np.float64)
+    x, y = undistort((x - bent.cx) / bent.fx, (y - bent.cy) / bent.fy, bent.distortion)
+    at = np.stack([x * bent.fx + bent.cx, y * bent.fy + bent.cy], -1)
+    photo = sample(opened.color(0).astype(np.float32), np.clip(at, 0.0, np.array(bent.size) - 1.0))[0]
+    write_png(tmp_path / "bent.png", np.rint(photo).astype(np.uint8))
+    files = [FrameFiles(opened.depth_file(0), str(tmp_path / "bent.png"), opened.pose(0))]
+    write_capture(tmp_path / "c.usda", replace(opened.rig, color=bent), files, world=np.eye(4))
+    plain, through = (LiveSource(ROOM, c, launcher=launcher) for c in (capture.capture, tmp_path / "c.usda"))
+    inner = np.s_[10:-10, 10:-10]
+    difference = np.abs(plain._guide(0).codes.astype(int) - through._guide(0).codes.astype(int))
+    moved = np.abs(photo - opened.color(0))
+    assert difference[inner].mean() < 0.3 * moved[inner].mean()
+    expected, found = (source.filtered().depth()[inner] for source in (plain, through))
+    assert (np.abs(found - expected) > 0.05).mean() < 0.005
 
 
 @needs_shared

@@ -18,7 +18,7 @@ from warp_dvct.capture.fusion import FusedMesh
 from warp_dvct.capture.grid import Grid, GridLimits, depth_grid, grid_mesh
 from warp_dvct.capture.intrinsics import Intrinsics
 from warp_dvct.capture.live_albedo import MOST_GAIN, SRGB, albedo_texture, brightness_ratio, light_ratio, nearest
-from warp_dvct.capture.registration import undistorted_depth
+from warp_dvct.capture.registration import sample, undistorted_depth
 from warp_dvct.capture.stage import Capture, CaptureRig, open_capture
 from warp_dvct.errors import FileError, OptionError, StageError
 from warp_dvct.launch import Launcher
@@ -91,6 +91,7 @@ class LiveSource:
         self._filtered: FilteredDepth | None = None
         self._mean: np.ndarray | None = None
         self._factor: float | None = None
+        self._straight: np.ndarray | None = None
         self._trial = 1.0
         self.skipped: list[str] = []
 
@@ -252,11 +253,18 @@ class LiveSource:
         return self._filtered
 
     def _guide(self, index: int) -> Guide | None:
-        """The photograph that depth jumps are moved to; None where there is none, or its lens bends."""
+        """The photograph that depth jumps are moved to, as a lens that does not bend would show it; None where there is
+        none."""
         lens = self.capture.rig.color
-        color = None if lens is None or lens.is_distorted else self.capture.color(index)
+        color = None if lens is None else self.capture.color(index)
         if lens is None or color is None:
             return None
+        if lens.is_distorted:
+            if self._straight is None:
+                plain = Intrinsics(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
+                most = np.array(lens.size) - 1.0
+                self._straight = np.clip(np.nan_to_num(lens.project(plain.rays()), nan=-1.0), 0.0, most)
+            color = np.rint(sample(color.astype(np.float32), self._straight)[0]).astype(np.uint8)
         return Guide(color, (lens.fx, lens.fy, lens.cx, lens.cy), self.capture.rig.depth_to_color)
 
     def _lights(self, scene: Scene, level: float) -> tuple[tuple[Light, ...], np.ndarray, tuple[Notice, ...]]:
