@@ -196,7 +196,7 @@ def made_model(threads: int = 2) -> CostModel:
         "gbuffer": {"pixels": 0.3},
         "ism": {"maps": 1e-6, "splats": 0.1, "texels": 0.09},
         "vpl shading": {"points": 0.5, "pairs": 0.1},
-        "vpl bounces": {"draws": 0.3},
+        "vpl bounces": {"points": 1.0},
     }
     return CostModel("cpu", threads, "made", units, {"gather": 2.0, "rsm": 1.5}, 0.1)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from warp_dvct.cost import Counts, direct_work, draws, frame_work, tree_depth
 from warp_dvct.passes.vpl_memory import vpl_count
 from warp_dvct.settings import Settings
@@ -36,7 +38,7 @@ def count_vpl_work(settings: Settings, survey: Survey, width: int, height: int) 
         passes["ism"] = {"frame": 1, "maps": 1e6 * count, "splats": splats, "texels": texels}
     if further:
         candidates = further * points
-        passes["vpl bounces"] = {"maps": further, "points": candidates, "draws": candidates * settings.vpls_sources}
+        passes["vpl bounces"] = {"maps": further, "points": candidates, "met": candidates * survey.met}
     passes["vpl shading"] = _shading(settings, survey, pixels, edges, count)
     if survey.roughness is not None:
         rays = sum(
@@ -53,10 +55,23 @@ def count_vpl_work(settings: Settings, survey: Survey, width: int, height: int) 
 
 
 def _shading(settings: Settings, survey: Survey, pixels: float, edges: float, count: float) -> Counts:
-    """Pairs of points and VPLs: a tile's pixels share these out; some points at edges take all."""
+    """Pairs of points and VPLs: a tile's pixels share these out, each point then looks at all of its tile, and some
+    points at edges take all.
+
+    In a closed scene more VPLs of further bounces carry light; the more maps there are, the fewer of them caches hold.
+    """
     hidden = 0.0 if survey.plate else survey.object * pixels + survey.edge.object * edges
     pairs = 1e6 * count * (pixels / settings.vpls_tiles**2 + hidden / settings.vpls_tiles)
     if settings.vpls_tiles == 1:
         pairs += 1e6 * count * edges
     alone = 1e6 * count * edges if settings.vpls_tiles > 1 else 0.0
-    return {"frame": 1, "points": pixels + edges, "pairs": pairs, "edge pairs": alone}
+    merged = (pixels + edges) * settings.vpls_tiles**2 if settings.vpls_tiles > 1 else 0.0
+    return {
+        "frame": 1,
+        "points": pixels + edges,
+        "merged": merged,
+        "pairs": pairs,
+        "pairs met": pairs * survey.met,
+        "pairs met by root": pairs * survey.met * math.sqrt(1e6 * count),
+        "edge pairs": alone,
+    }
