@@ -432,7 +432,7 @@ def test_a_scan_s_points_are_part_of_what_is_surveyed(monkeypatch, tmp_path):
     whole = planning.survey
     monkeypatch.setattr(planning, "survey", lambda *args, **kwargs: found.append(whole(*args, **kwargs)) or found[-1])
     points = np.random.default_rng(0).uniform(-0.3, 0.3, (50, 3))
-    up = np.tile(np.float32([0.0, 1.0, 0.0]), (50, 1))
+    up = np.tile(np.array([0.0, 1.0, 0.0], np.float32), (50, 1))
     cloud = PointCloud(points, up, np.full(50, 0.01, np.float32), Role.REAL)
     for clouds in ((), (cloud,)):
         Relighter(replace(scene, point_clouds=clouds), width=48).keep_budget(3.0)
