@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 DARKEST = 0.02  # mean of a photograph below which its surroundings are not taken to be
 GREY = 0.5  # albedo where no photograph shows a surface; the mean one of all surfaces, where light is not known
 FIT_ROUNDS = 4
+COARSE = 4  # pixels between those of the surface on which light is compared with the photograph
 BEHIND = 0.025  # metres: about the noise of a depth camera, behind which the rest of a room lies
 
 Progress = Callable[[int, int], None]
@@ -176,9 +177,12 @@ class LiveSource:
         mesh = replace(mesh, corner_uvs=uvs.astype(np.float32)[grid.triangles])
         file, photo = self.capture.color_file(index) or "", SRGB[color]
         gain = balance * factor if known else balance
-        made = self._with_real(scene, mesh, box, albedo_texture(photo, gain, file), uvs)
         if not fit:
-            return made
+            return self._with_real(scene, mesh, box, albedo_texture(photo, gain, file), uvs)
+        coarse = self._grid(filtered, every=COARSE)
+        uvs_small = _texture_coordinates(coarse, self.capture.rig)
+        small = grid_mesh(coarse, pose, len(scene.materials), uvs_small, self.capture.depth_path)
+        made = self._with_real(scene, small, box, albedo_texture(photo, gain, file), uvs_small, box_uvs=uvs)
         gain = gain * light_ratio(made, photo, self._launcher, 0.5 if known else 0.0)
         return self._with_real(scene, mesh, box, albedo_texture(photo, gain, file), uvs)
 
@@ -189,8 +193,13 @@ class LiveSource:
         box: Enclosure | None,
         texture: Texture | None = None,
         uvs: np.ndarray | None = None,
+        box_uvs: np.ndarray | None = None,
     ) -> Scene:
-        """``scene`` with the live surface, its material the next one, and the rest of the room around it."""
+        """``scene`` with the live surface, its material the next one, and the rest of the room around it.
+
+        Args:
+            uvs: Of the surface. box_uvs: Of the one that ``box`` was found for, where that is another.
+        """
         surface = Material(
             base_color=(GREY, GREY, GREY),
             roughness=1.0,
@@ -199,8 +208,9 @@ class LiveSource:
             name=f"{self.capture.depth_path} (live)",
         )
         meshes, materials, albedo = (mesh,), (surface,), np.full((len(mesh.points), 3), GREY)
-        if texture is not None and uvs is not None:
-            albedo = nearest(texture.pixels, uvs)
+        shown = uvs if box_uvs is None else box_uvs
+        if texture is not None and shown is not None:
+            albedo = nearest(texture.pixels, shown)
         if box is not None:
             path = f"{self.capture.depth_path} (surroundings)"
             white = Material(base_color=(1.0, 1.0, 1.0), roughness=1.0, ior=1.0, name=path)
@@ -326,11 +336,15 @@ class LiveSource:
             self._trial = 1.0
         return self._factor
 
-    def _grid(self, filtered: FilteredDepth) -> Grid:
-        options = self._options.filter
-        limits = GridLimits(options.edge * options.noise, options.edge_share, self._options.tolerance * options.noise)
-        inverse = filtered.inverse.numpy().reshape(filtered.height, filtered.width)
-        return depth_grid(inverse, filtered.normals(), self.capture.rig.depth, limits)
+    def _grid(self, filtered: FilteredDepth, every: int = 1) -> Grid:
+        """The surface; of every so many pixels both ways."""
+        options, lens = self._options.filter, self.capture.rig.depth
+        share = options.edge_share * every
+        limits = GridLimits(options.edge * options.noise, share, self._options.tolerance * options.noise)
+        inverse = filtered.inverse.numpy().reshape(filtered.height, filtered.width)[::every, ::every]
+        height, width = inverse.shape
+        lens = Intrinsics(width, height, lens.fx / every, lens.fy / every, lens.cx / every, lens.cy / every)
+        return depth_grid(inverse, filtered.normals()[::every, ::every], lens, limits)
 
 
 def _view(capture: Capture, index: int, pose: np.ndarray, *, has_color: bool) -> Camera:
