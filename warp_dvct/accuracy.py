@@ -125,10 +125,10 @@ class Accuracy:
         factor, added = 1.0, 0.0
         for ladder in LADDERS_OF[method]:
             excess = self.excess(ladder.knob, settings, survey, method)
-            # Independent errors add up; what improves takes a share off what the others left, and these overlap.
+            # Independent errors add up; what improves takes a share off the reference's own, and these overlap.
             added += max(excess, 0.0)
             factor *= 1.0 + min(excess, 0.0)
-        return self.reference(survey, width, method) * math.sqrt(factor ** self.base["overlap"] * (1.0 + added))
+        return self.reference(survey, width, method) * math.sqrt(factor ** self.base["overlap"] + added)
 
     def excess(self, knob: str, settings: Settings, survey: Survey, method: str = "delta-cones") -> float:
         """Of squared FLIP over that at the reference, where only ``knob`` is as in ``settings``."""
