@@ -59,6 +59,10 @@ def test_a_survey_counts_what_is_in_the_picture(surveys):
     assert (glossy.focuses, room.focuses) == (True, False)
     assert room.object < room.affected <= 1.0
     assert 0.0 < room.near < 1.0
+    # Rays from the objects start in their box, few of those from the walls pass it, and more where detail is.
+    assert room.on_object.entered > 0.8
+    assert 0.02 < room.on_real.entered < room.on_real.entered_again < 0.5
+    assert ground.on_real.entered_again > 2 * ground.on_real.entered
     # A room of 3.6 x 2.2 x 4 m, from within: 47.8 square metres in a coarse volume of about 4.1 m an edge.
     assert 2.5 < room.coarse.records / room.coarse.n**2 < 8.0
 
