@@ -6,11 +6,11 @@ surface in it, with no conservative thickening and no gaps.
 
 import warp as wp
 
+from warp_dvct.kernels.sorting import EMPTY_KEY
 from warp_dvct.kernels.volume import BRICK, brick_extent, cell_key, face_weight, key_cell
 
 wp.set_module_options({"enable_backward": False})
 
-EMPTY_KEY = wp.constant(0x7FFFFFFF)  # sorts behind every voxel
 SLIVER = wp.constant(1.0e-7)  # voxel faces; smaller cuts are rounding where a triangle only touches a voxel,
 SLIVER_SHARE = wp.constant(1.0e-3)  # unless they are more than this share of a triangle that is itself so small
 MAX_CORNERS = wp.constant(10)  # a triangle cut by six planes has at most nine corners
@@ -380,37 +380,6 @@ def _join_fragments(
 
 
 @wp.kernel
-def _mark_starts(first: int, key_in: wp.array(dtype=wp.int32), shift: int, start_out: wp.array(dtype=wp.int32)):
-    """1 where a sorted key, less its ``shift`` lowest bits, differs from the one before it; 0 for EMPTY_KEY."""
-    i = first + wp.tid()
-    key = key_in[i]
-    start = int(0)
-    if key != EMPTY_KEY:
-        start = 1
-        if i > 0:
-            if (key_in[i - 1] >> shift) == (key >> shift):
-                start = 0
-    start_out[i] = start
-
-
-@wp.kernel
-def _list_starts(
-    first: int,
-    key_in: wp.array(dtype=wp.int32),
-    mark_in: wp.array(dtype=wp.int32),
-    rank_in: wp.array(dtype=wp.int32),
-    shift: int,
-    key_out: wp.array(dtype=wp.int32),
-    start_out: wp.array(dtype=wp.int32),
-):
-    """Unique keys and where their runs begin; ``rank_in`` is the inclusive scan of ``mark_in``."""
-    i = first + wp.tid()
-    if mark_in[i] == 1:
-        key_out[rank_in[i] - 1] = key_in[i] >> shift
-        start_out[rank_in[i] - 1] = i
-
-
-@wp.kernel
 def _parent_keys(first: int, key_in: wp.array(dtype=wp.int32), n: int, level: int, key_out: wp.array(dtype=wp.int32)):
     """Keys, one level up, of the voxels that hold the voxels of a level."""
     i = first + wp.tid()
@@ -485,24 +454,3 @@ def _sum_areas(
         real = float(real_sum)
         synthetic = float(synthetic_sum)
         area_out[i * 6 + face] = wp.vec2(real, wp.min(real + synthetic, wp.max(wp.max(real, synthetic), 1.0)))
-
-
-@wp.kernel
-def _count_up(first: int, order_out: wp.array(dtype=wp.int32)):
-    i = first + wp.tid()
-    order_out[i] = i
-
-
-@wp.kernel
-def _find_end(first: int, key_in: wp.array(dtype=wp.int32), count: int, end_out: wp.array(dtype=wp.int32)):
-    """The number of sorted keys before EMPTY_KEY, by halving; one element."""
-    i = first + wp.tid()
-    low = int(0)
-    high = int(count)
-    while low < high:
-        middle = (low + high) / 2
-        if key_in[middle] == EMPTY_KEY:
-            high = middle
-        else:
-            low = middle + 1
-    end_out[i] = low

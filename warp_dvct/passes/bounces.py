@@ -11,10 +11,11 @@ from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kept import Kept
 from warp_dvct.kernels import bounces as kernels
 from warp_dvct.kernels.bounce_field import BounceField
+from warp_dvct.kernels.sorting import EMPTY_KEY
 from warp_dvct.kernels.volume import Volume
-from warp_dvct.kernels.voxelization import EMPTY_KEY
 from warp_dvct.launch import Launcher
-from warp_dvct.passes.voxels import Voxels, count_below, sort_by_key, unique_runs
+from warp_dvct.passes.sorting import count_below, sort_by_key, unique_runs
+from warp_dvct.passes.voxels import Voxels
 
 BURIED = 0.5  # voxels of level 0: a patch that something covers within that distance stands for little but itself
 PATCH_HITS = "patches' real hits"

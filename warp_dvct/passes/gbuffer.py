@@ -12,7 +12,7 @@ from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import gbuffer as kernels
 from warp_dvct.kernels.gbuffer import Points
 from warp_dvct.launch import Launcher
-from warp_dvct.passes.voxels import scan
+from warp_dvct.passes.sorting import scan
 
 SPHERE_MARGIN = 1.001  # of a radius: keeps rounding from culling a ray that barely meets what is in the sphere
 EDGE_SHARE = 8  # room for one edge point in so many pixels is there from the start, and saves most pictures a copy

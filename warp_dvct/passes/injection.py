@@ -9,7 +9,8 @@ import warp as wp
 from warp_dvct.kernels import injection as kernels
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.rsm import ShadowMaps
-from warp_dvct.passes.voxels import Voxels, count_below, sort_by_key, unique_runs
+from warp_dvct.passes.sorting import count_below, sort_by_key, unique_runs
+from warp_dvct.passes.voxels import Voxels
 
 
 def empty_flux(launcher: Launcher, voxels: Voxels) -> Any:
