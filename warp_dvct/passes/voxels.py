@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_dvct.kernels import sorting
 from warp_dvct.kernels import voxelization as kernels
 from warp_dvct.kernels.volume import Volume
 from warp_dvct.launch import Launcher
@@ -190,7 +191,7 @@ def _join(launcher: Launcher, real: Pieces, synthetic: Pieces, synthetic_first: 
             [mine.key, mine.triangle, mine.place, other.key, other.count, ties, first],
             [key, triangle, place],
         )
-    launcher.launch(kernels._count_up, count, [], [order])
+    launcher.launch(sorting._count_up, count, [], [order])
     keys, starts = unique_runs(launcher, key, count)
     return Fragments(triangle, place, order, starts, count), keys
 
