@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from warp_dvct.kernels.volume import Volume, face_weight, find_record
 from warp_dvct.kernels.sorting import EMPTY_KEY
+from warp_dvct.kernels.volume import Volume, face_weight, find_record
 
 wp.set_module_options({"enable_backward": False})
 

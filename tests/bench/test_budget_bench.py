@@ -9,11 +9,11 @@ from dataclasses import asdict
 import pytest
 from click.testing import CliRunner
 
+from warp_dvct.accuracy import REFERENCE
 from warp_dvct.bench import budget as module
 from warp_dvct.bench import error_table
 from warp_dvct.bench.__main__ import bench
 from warp_dvct.bench.rows import append_row, read_rows
-from warp_dvct.accuracy import REFERENCE
 from warp_dvct.errors import OptionError
 from warp_dvct.settings import make_settings
 
