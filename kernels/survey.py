@@ -38,8 +38,8 @@ def _look_around(
     entered_out: wp.array(dtype=wp.int32),
     nearness_out: wp.array(dtype=wp.float32),
 ):
-    """Of a point's cosine-distributed rays, how many meet anything (-1 where there is no surface), how many pass the box
-    of the synthetic objects before they meet something real, and the mean inverse distance of what they meet."""
+    """Of a point's cosine-distributed rays, how many meet anything (-1 where there is no surface), how many pass the
+    synthetic objects' box before they meet something real, and the mean inverse distance of what they meet."""
     i = first + wp.tid()
     j = index_in[i]
     entered_out[i] = 0

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from warp_dvct.kernels.gather import World, radiosity_at
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.gather import Gatherer, gather_all, gather_sparse, shade_indirect
 from warp_dvct.passes.gbuffer import render_gbuffer
@@ -161,6 +162,33 @@ def test_furnace_through_the_sparse_path(launcher, cones):
     np.testing.assert_allclose(after, np.broadcast_to([1.0, 2.0, 3.0], after.shape), rtol=2e-3)
     real = buffer.points.role.numpy()[: buffer.count] == 0
     np.testing.assert_allclose(before[real], np.broadcast_to([1.0, 2.0, 3.0], before[real].shape), rtol=2e-3)
+
+
+@wp.kernel
+def _look_up(first: int, world: World, at: wp.vec3, footprint: float, found_out: wp.array(dtype=wp.vec3)):
+    i = first + wp.tid()
+    found_out[i] = radiosity_at(world, at, wp.vec3(0.0, 1.0, 0.0), footprint).after
+
+
+def test_a_sliver_that_caught_a_whole_texel_does_not_shine(launcher):
+    """The floor ends 3 % into its last voxels, whose flux is that of a texel of a quarter voxel; the ones before have
+    so much less. Every ray that meets the sliver finds the floor's radiosity within 30 %, wide or narrow."""
+    n, edge = 8, 0.03 / 8
+
+    def flux_of(_, voxels):
+        flux = lit.uniform_flux(launcher, voxels, np.ones(3)).numpy().reshape(-1, 12, 3)
+        sliver = flux[:, 4:6].max((1, 2)) < 0.1
+        assert sliver.sum() == n
+        flux[sliver, 4:6] = 0.25
+        flux[~sliver, 4:6] *= 1.0 - (0.25 - 0.03) / (~sliver).sum() * n
+        return launcher.array(flux.reshape(-1, 3), wp.vec3)
+
+    floor = lit.rectangle((0.25 + edge / 2, 0.3, 0.5), (0, 0, 0.5), (0.25 + edge / 2, 0, 0))
+    world = lit.lit_world(launcher, lit.scene_of(lit.mesh(floor)), n, flux_of).world
+    found = launcher.zeros(1, wp.vec3)
+    for footprint in (0.01, 0.2, 0.9):
+        launcher.launch(_look_up, 1, [world, wp.vec3(0.5 + edge / 2, 0.3, 0.5), footprint], [found])
+        np.testing.assert_allclose(found.numpy(), 1.0, rtol=0.3)
 
 
 def test_points_of_index_minus_one_and_background_get_zero(launcher):
