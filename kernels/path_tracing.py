@@ -187,7 +187,7 @@ def make_vertex(origin: wp.vec3, direction: wp.vec3, throughput: wp.vec3, depth:
     return v
 
 
-@wp.func(inline=False)  # it is called in three places of two kernels; CUDA builds would hold twelve copies
+@wp.func
 def follow(
     geo: Geometry,
     mats: Materials,
@@ -272,22 +272,28 @@ def follow_pair(
 ) -> Pair:
     """Follow a path for both pictures, or its two halves; vertices without a hit have nothing to follow."""
     out = Pair()
-    if on_both.hit.found != 0:
-        shared = follow(geo, mats, lights, config, on_both, BOTH, index, sample)
-        out.before += shared.before
-        out.after += shared.after
-        on_after = shared.on_after
-        on_before = shared.on_before
-    if on_after.hit.found != 0:
-        half = follow(geo, mats, lights, config, on_after, AFTER, index, sample)
-        out.after += half.after
-    if on_before.hit.found != 0:
-        half = follow(geo, mats, lights, config, on_before, BEFORE, index, sample)
-        out.before += half.before
+    part = int(0)
+    while part < 3:
+        want = int(BOTH)
+        start = on_both
+        if part == 1:
+            want = AFTER
+            start = on_after
+        if part == 2:
+            want = BEFORE
+            start = on_before
+        if start.hit.found != 0:
+            walk = follow(geo, mats, lights, config, start, want, index, sample)
+            out.before += walk.before
+            out.after += walk.after
+            if part == 0:
+                on_after = walk.on_after
+                on_before = walk.on_before
+        part += 1
     return out
 
 
-@wp.func(inline=False)
+@wp.func
 def trace_pair(
     geo: Geometry,
     mats: Materials,
