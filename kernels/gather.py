@@ -28,8 +28,8 @@ wp.set_module_options({"enable_backward": False})
 
 
 FAINT = wp.constant(1.0e-6)  # coverage below which a voxel says nothing of a surface
-# Share of a face that a voxel must hold to stand alone: whole texels of a map land in slivers or miss them, so that only
-# with its neighbours' does a sliver's flux stand for its surface.
+# Share of a face that a voxel must hold to stand alone: whole texels of a map land in slivers or miss them, so that a
+# sliver's flux stands for its surface only with its neighbours'.
 SLIVER = wp.constant(0.25)
 COARSE_FOOTPRINT = wp.constant(2.0)  # coarse voxels that a ray must cover before one of them may stand for it
 
@@ -119,8 +119,8 @@ def voxel_pair(volume: Volume, position: wp.vec3, normal: wp.vec3) -> FieldPair:
 def radiosity_at(world: World, position: wp.vec3, normal: wp.vec3, footprint: float) -> Incident:
     """Radiosity of a surface point, averaged over about ``footprint``.
 
-    Wide rays read one voxel, of the coarse volume where that is fine enough; narrow ones, and those that meet a sliver of
-    surface, interpolate the fine volume. Where a volume holds no such surface the next one is asked.
+    Wide rays read one voxel, of the coarse volume where that is fine enough; narrow ones, and those that meet a sliver,
+    interpolate the fine volume. Where a volume holds no such surface the next one is asked.
     """
     pair = FieldPair()
     if world.has_coarse != 0 and footprint > COARSE_FOOTPRINT * world.coarse.voxel:
