@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_dvct.kernels.cones import DUAL, OPAQUE, ConeSettings, march_cone
 from warp_dvct.kernels.environment import Environment, environment_radiance
-from warp_dvct.kernels.gbuffer import BACKGROUND, SYNTHETIC, UNSEEN, Points, first_sample, load_surface
+from warp_dvct.kernels.gbuffer import BACKGROUND, SYNTHETIC, UNSEEN, Points, first_sample, load_surface, share_of
 from warp_dvct.kernels.geometry import (
     FAR,
     Geometry,
@@ -330,6 +330,7 @@ def _gather_rays(
     geo: Geometry,
     world: World,
     rays: int,
+    edge_samples: int,
     stride: int,
     seed: int,
     kept_out: KeptRays,
@@ -339,11 +340,13 @@ def _gather_rays(
 ):
     """Irradiance [W m^-2] from indirect light and domes, by cosine-distributed exact rays (eq. 6's integral).
 
-    ``stride`` is the spacing of the gathered points in pixels. ``nearness_out`` is the mean inverse distance of what
+    ``stride`` is the spacing of the gathered points in pixels; a pixel's ``edge_samples`` points share its rays out.
+    ``nearness_out`` is the mean inverse distance of what
     the rays met.
     """
     i = first + wp.tid()
     j = index_in[i]
+    share = int(rays)
     nearness = float(0.0)
     before = wp.vec3(0.0, 0.0, 0.0)
     after = wp.vec3(0.0, 0.0, 0.0)
@@ -353,9 +356,10 @@ def _gather_rays(
             known = False
             if kept_out.present != 0:
                 known = kept_out.point[i] == j
-            start = first_sample(rays, rays, stride, points, j)
-            for k in range(rays):
-                ray = gathered_ray(geo, s, rays, seed, start + k, kept_out, known, i * rays + k)
+            share = share_of(rays, points, j, edge_samples)
+            start = first_sample(rays, share, stride, points, j)
+            for k in range(share):
+                ray = gathered_ray(geo, s, share, seed, start + k, kept_out, known, i * rays + k)
                 if ray.up != 0:
                     light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
                     before += light.before
@@ -363,9 +367,9 @@ def _gather_rays(
                     nearness += inverse_distance(light)
             if kept_out.present != 0:
                 kept_out.point[i] = j
-    before_out[i] = before / float(rays)
-    after_out[i] = after / float(rays)
-    nearness_out[i] = nearness / float(rays)
+    before_out[i] = before / float(share)
+    after_out[i] = after / float(share)
+    nearness_out[i] = nearness / float(share)
 
 
 @wp.kernel
@@ -377,6 +381,7 @@ def _gather_rays_glossy(
     world: World,
     hits: GlossyHits,
     rays: int,
+    edge_samples: int,
     stride: int,
     seed: int,
     kept_out: KeptRays,
@@ -387,6 +392,7 @@ def _gather_rays_glossy(
     """As ``_gather_rays``, where what rays meet may be glossy: apart, because it takes three times the registers."""
     i = first + wp.tid()
     j = index_in[i]
+    share = int(rays)
     nearness = float(0.0)
     before = wp.vec3(0.0, 0.0, 0.0)
     after = wp.vec3(0.0, 0.0, 0.0)
@@ -396,9 +402,10 @@ def _gather_rays_glossy(
             known = False
             if kept_out.present != 0:
                 known = kept_out.point[i] == j
-            start = first_sample(rays, rays, stride, points, j)
-            for k in range(rays):
-                ray = gathered_ray(geo, s, rays, seed, start + k, kept_out, known, i * rays + k)
+            share = share_of(rays, points, j, edge_samples)
+            start = first_sample(rays, share, stride, points, j)
+            for k in range(share):
+                ray = gathered_ray(geo, s, share, seed, start + k, kept_out, known, i * rays + k)
                 if ray.up != 0:
                     light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
                     light = focused_incident(light, hits, geo, world, ray, start + k)
@@ -407,9 +414,9 @@ def _gather_rays_glossy(
                     nearness += inverse_distance(light)
             if kept_out.present != 0:
                 kept_out.point[i] = j
-    before_out[i] = before / float(rays)
-    after_out[i] = after / float(rays)
-    nearness_out[i] = nearness / float(rays)
+    before_out[i] = before / float(share)
+    after_out[i] = after / float(share)
+    nearness_out[i] = nearness / float(share)
 
 
 @wp.kernel

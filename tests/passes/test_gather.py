@@ -191,6 +191,21 @@ def test_a_sliver_that_caught_a_whole_texel_does_not_shine(launcher):
         np.testing.assert_allclose(found.numpy(), 1.0, rtol=0.3)
 
 
+def test_points_of_an_edge_pixel_share_its_rays_out(launcher):
+    """Four points at one place, under a ceiling that covers a part of what they see: together they are a whole one."""
+    ceiling = lit.mesh(lit.rectangle((0.37, 0.53, 0.41), (0.27, 0, 0.1), (0, 0, 0.33)))
+    world = lit.lit_world(launcher, lit.scene_of(ceiling), 16, lambda _, v: lit.uniform_flux(launcher, v, np.ones(3)))
+    index = launcher.array(np.arange(4, dtype=np.int32), wp.int32)
+    points = lit.points_at(launcher, [[0.5, 0.1, 0.5]] * 4, (0, 1, 0))
+    gatherer = Gatherer(world.device_scene, world.world, 64, 0, edge_samples=4)
+    whole = gatherer.run(launcher, points, index, 4)[0].numpy()[0]
+    assert 0.1 < whole[0] < 0.9
+    points.slot = launcher.array(np.arange(4, dtype=np.int32), wp.int32)
+    shares = gatherer.run(launcher, points, index, 4)[0].numpy()
+    assert len(np.unique(shares[:, 0])) > 1
+    np.testing.assert_allclose(shares.mean(0), whole, rtol=1e-5)
+
+
 def test_points_of_index_minus_one_and_background_get_zero(launcher):
     world, _ = furnace_view(launcher)
     points = lit.points_at(launcher, [[0.5, 0.1, 0.5]] * 2, (0, 1, 0), role=[0, -1])

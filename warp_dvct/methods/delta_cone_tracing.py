@@ -372,7 +372,7 @@ def _irradiance(
     cone = None
     if settings.gather == "cones":
         cone = _cone(plan, math.radians(settings.cones_aperture))
-    shared = settings.seed, settings.cones_count, cone, part.with_before, hits
+    shared = settings.seed, settings.cones_count, cone, part.with_before, hits, max(1, settings.antialias)
     real = Gatherer(scene, world, settings.gather_rays, *shared)
     if part.points is not buffer.points:
         fewer = Gatherer(scene, world, max(1, settings.gather_rays // 4), *shared)

@@ -26,6 +26,7 @@ class Gatherer:
     """How irradiance is gathered at a list of points: exact rays, or cones where ``cone`` is given.
 
     ``hits``: ``GlossyHits`` (:func:`glossy_hits`), for rays; None where surfaces met are taken as Lambertian.
+    ``edge_samples``: Points of an edge pixel, which share its rays out.
     """
 
     scene: DeviceScene
@@ -36,6 +37,7 @@ class Gatherer:
     cone: Any = None
     with_before: bool = True
     hits: Any = None
+    edge_samples: int = 1
 
     def run(
         self,
@@ -63,7 +65,7 @@ class Gatherer:
             how = [self.cones, self.cone, int(self.with_before), self.seed]
             launcher.launch(kernels._gather_cones, count, [*shared, *how], [before, after])
             return before, after
-        how = [self.rays, stride, self.seed, kept or keep_rays(launcher, 0, 0)]
+        how = [self.rays, self.edge_samples, stride, self.seed, kept or keep_rays(launcher, 0, 0)]
         if self.hits is None:
             launcher.launch(kernels._gather_rays, count, [*shared, *how], [before, after, nearness])
         else:
