@@ -197,6 +197,7 @@ def test_points_of_an_edge_pixel_share_its_rays_out(launcher):
     world = lit.lit_world(launcher, lit.scene_of(ceiling), 16, lambda _, v: lit.uniform_flux(launcher, v, np.ones(3)))
     index = launcher.array(np.arange(4, dtype=np.int32), wp.int32)
     points = lit.points_at(launcher, [[0.5, 0.1, 0.5]] * 4, (0, 1, 0))
+    points.pixel = launcher.zeros(4, wp.vec2i)
     gatherer = Gatherer(world.device_scene, world.world, 64, 0, edge_samples=4)
     whole = gatherer.run(launcher, points, index, 4)[0].numpy()[0]
     assert 0.1 < whole[0] < 0.9
