@@ -107,7 +107,8 @@ class DeviceScene:
     def synthetic_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Box (low, high) in volume space around the synthetic triangles, of which there must be some."""
         corners = self.triangles_vs[self.synthetic_first :].reshape(-1, 3)
-        return tuple(np.array([end(corners[:, k]) for k in range(3)]) for end in (np.min, np.max))
+        low, high = (np.array([end(corners[:, k]) for k in range(3)]) for end in (np.min, np.max))
+        return low, high
 
 
 @dataclass(frozen=True)
