@@ -208,6 +208,26 @@ def test_a_dome_takes_no_light_away():
     assert (grid @ bound).min() > 0.4 * (grid @ free).min()
 
 
+def test_what_shading_does_not_tell_apart_has_one_colour():
+    """Two lights that shade nearly alike, with noise in the colours: alone each channel splits them anew; drawn to what
+    they are in grey they keep it. Lights that shading does tell apart keep their own colours."""
+    rng = np.random.default_rng(4)
+    shade = rng.uniform(0.5, 1.5, 400)
+    alike = np.column_stack([shade, shade + 0.02 * rng.standard_normal(400)])
+    grey = np.array([1.0, 0.5])
+
+    def ratios(matrix, target, **drawn):
+        found = [nonnegative_light(matrix, target[:, c], 1, **drawn) for c in range(3)]
+        return np.array([light[1] / light[0] for light in found])
+
+    noisy = (alike @ grey)[:, None] + 0.15 * rng.standard_normal((400, 3))
+    assert np.ptp(ratios(alike, noisy)) > 0.3
+    np.testing.assert_allclose(ratios(alike, noisy, prior=grey, trust=0.1), 0.5, rtol=0.05)
+    apart = np.column_stack([shade, rng.uniform(0.0, 2.0, 400)])
+    told = apart @ np.array([[1.0, 1.0, 1.0], [0.3, 0.5, 0.8]])
+    np.testing.assert_allclose(ratios(apart, told, prior=grey, trust=0.002), [0.3, 0.5, 0.8], rtol=0.03)
+
+
 def test_clusters_do_not_see_shading():
     rng = np.random.default_rng(0)
     paint = np.array([[0.5, 0.5, 0.5], [0.6, 0.1, 0.1]])[np.repeat([0, 1], 100)]

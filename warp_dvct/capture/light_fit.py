@@ -1,8 +1,9 @@
 """Light of a captured place from its shading alone: a dome of low order and one dominant direction.
 
 What a photograph shows of a matt surface is albedo times irradiance, and neither is known. Surfaces of one colour are
-taken to have one albedo; then shading tells the light up to a factor per channel, which two conventions fix: the
-irradiance is white on average, as photographs are balanced, and the lightest surfaces reflect as much as white paint.
+taken to have one albedo; then shading tells the light up to a factor per channel, which two conventions fix: light
+that arrives directly is white on average, as photographs are balanced, and the lightest surfaces reflect as much as
+white paint.
 
 The irradiance comes from the renderer's own kernels, and its Jacobian from Warp's tape (``kernels.light_fit``). Where
 it is wrong: lamps that are near, more than one sun, surfaces whose texture follows the shading.

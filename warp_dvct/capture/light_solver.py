@@ -18,6 +18,9 @@ SAME = 0.25  # the same, where it is known
 LOW, HIGH = 0.02, 0.95  # no matt surface is blacker than velvet or whiter than fresh snow
 LIGHTEST = 0.8  # albedo of the lightest surfaces, the 99th percentile: white paint or paper
 RIDGE = 0.02  # of the normal matrix' mean diagonal: what shading does not tell stays even
+# Of the same, times the squared relative residual: what draws all parts of the light to one colour where shading leaves
+# open how they share it. Parts that differ by a seventh, told by ten independent places: 1 / (0.14**2 * 10).
+EVEN_COLORS = 5.0
 NEGATIVE = 30.0  # of the same: what keeps the dome from taking light away
 GRID = 200  # directions at which it is kept from that
 MOST_TURN = np.radians(10.0)  # of the dominant light in one step
@@ -109,7 +112,13 @@ class Solver:
         value, gradient = self.sun(self.x.toward)
         matrix = np.column_stack([self.dome, value]) * row[:, None]
         width = self.dome.shape[1]
-        solved = np.stack([nonnegative_light(matrix, target[:, c] * row, width) for c in range(3)], -1)
+        grey = nonnegative_light(matrix, (target @ LUMINANCE) * row, width)
+        tint = (target * row[:, None]).sum(0) / max(float(((target @ LUMINANCE) * row).sum()), 1e-12)
+        even = EVEN_COLORS * self.residual() ** 2
+        solved = np.stack(
+            [nonnegative_light(matrix, target[:, c] * row, width, prior=grey * tint[c], trust=even) for c in range(3)],
+            -1,
+        )
         self.x.harmonics, self.x.irradiance = solved[:width], solved[width]
         if turn and self.x.irradiance.any():
             self._turn(gradient, row)
@@ -178,8 +187,12 @@ class Solver:
             self.x.albedo[mine] = np.median(quotient[trusted if trusted.any() else mine], axis=0)
 
     def _normalize(self) -> None:
-        """Irradiance white on average, lightest surfaces at LIGHTEST: light and albedo trade a factor per channel."""
-        mean = self.predicted().mean(0)
+        """Light white on average, lightest surfaces at LIGHTEST: light and albedo trade a factor per channel.
+
+        The light that arrives directly, not what bounced: photographs are balanced for their lamps or their sky, and a
+        wooden floor stays brown in them and colours what stands on it.
+        """
+        mean = (self.predicted() * (1.0 - self.bounced)).mean(0)
         factor = (mean @ LUMINANCE) / np.maximum(mean, 1e-12)
         lightest = np.percentile((self.x.albedo / factor) @ LUMINANCE, 99.0)
         factor = factor * lightest / LIGHTEST
@@ -187,14 +200,18 @@ class Solver:
         self.x.harmonics, self.x.irradiance = self.x.harmonics * factor, self.x.irradiance * factor
 
 
-def nonnegative_light(matrix: np.ndarray, target: np.ndarray, harmonics: int) -> np.ndarray:
+def nonnegative_light(
+    matrix: np.ndarray, target: np.ndarray, harmonics: int, *, prior: np.ndarray | None = None, trust: float = 0.0
+) -> np.ndarray:
     """Least squares for a dome's harmonics and, in a last column if there is one, a light; neither takes light away.
 
     The harmonics beyond the constant one are drawn to 0 by a small ridge, and directions in which the dome is negative
-    are drawn to 0 until hardly any is left.
+    are drawn to 0 until hardly any is left. All are drawn to ``prior``, by ``trust`` of the matrix' mean diagonal.
     """
     normal, right = matrix.T @ matrix, matrix.T @ target
     unit = float(np.trace(normal)) / len(normal) + 1e-12
+    if prior is not None:
+        normal, right = normal + trust * unit * np.eye(len(normal)), right + trust * unit * prior
     basis = harmonics_of(fibonacci_sphere(GRID))[:, :harmonics]
     ridge = np.full(len(normal), RIDGE * unit)
     ridge[0], ridge[harmonics:] = 1e-6 * unit, 1e-6 * unit
