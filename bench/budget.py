@@ -59,15 +59,7 @@ def measure(
     if options.samples:
         import_flip()
         launcher = Launcher(options.device, options.threads)
-        store = ReferenceStore(
-            scene,
-            options.width,
-            height,
-            samples=options.samples,
-            seed=options.seed,
-            cache=options.cache,
-            launcher=launcher,
-        )
+        store = ReferenceStore.of(scene, options, launcher)
         truth = store.get(MANY_BOUNCES)
     plate = truth.before if truth else np.full((height, options.width, 3), 0.5, np.float32)
     small = Relighter(scene, method=options.method, width=48, device=options.device, threads=options.threads)

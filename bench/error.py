@@ -100,16 +100,7 @@ def measure(stage: str, options: ErrorOptions) -> Report:
         raise OptionError(f"--width is {options.width}; FLIP needs pictures of at least 16 pixels")
     launcher = Launcher(options.device, options.threads)
     scene = read(stage_file(stage))
-    height = max(1, round(options.width / scene.camera.aspect))
-    store = ReferenceStore(
-        scene,
-        options.width,
-        height,
-        samples=options.samples,
-        seed=options.seed,
-        cache=options.cache,
-        launcher=launcher,
-    )
+    store = ReferenceStore.of(scene, options, launcher)
     glossy, direct = store.glossy_mask(), store.get(0)
     blocks = []
     for title, bounces, overrides in (
@@ -131,7 +122,7 @@ def measure(stage: str, options: ErrorOptions) -> Report:
         blocks.append(Block(title, bounces, store.samples, truth.noise, pixels, rows))
         if options.out is not None:
             _save_pictures(options.out, f"{Path(stage).stem}_{bounces}", truth.comp, layers, options.exposure)
-    return Report(Path(stage).stem, options.width, height, blocks)
+    return Report(Path(stage).stem, options.width, store.height, blocks)
 
 
 def stage_file(stage: str) -> Path:

@@ -91,16 +91,7 @@ def measure(stage: str, options: PeerOptions) -> PeerReport:
     import_flip()
     launcher = Launcher(options.device, options.threads)
     scene = read(stage_file(stage))
-    height = max(1, round(options.width / scene.camera.aspect))
-    store = ReferenceStore(
-        scene,
-        options.width,
-        height,
-        samples=options.samples,
-        seed=options.seed,
-        cache=options.cache,
-        launcher=launcher,
-    )
+    store = ReferenceStore.of(scene, options, launcher)
     truth = store.get(options.bounces)
     affected = affected_mask(smooth_delta(truth.delta, truth.coverage), truth.coverage)
     rows: list[PeerRow] = []
@@ -114,7 +105,7 @@ def measure(stage: str, options: PeerOptions) -> PeerReport:
 
     _add_ours(add, scene, truth, options)
     left_out, notes = add_mitsuba(add, scene, truth, options)
-    return PeerReport(Path(stage).stem, options.width, height, truth.noise, rows, left_out, notes)
+    return PeerReport(Path(stage).stem, options.width, store.height, truth.noise, rows, left_out, notes)
 
 
 def timed(picture: Callable[[], np.ndarray]) -> tuple[np.ndarray, float, float]:

@@ -11,7 +11,7 @@ import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from tqdm import tqdm
@@ -63,6 +63,22 @@ def combine(plate: np.ndarray, delta: np.ndarray, synthetic: np.ndarray) -> np.n
     return np.maximum(synthetic[..., :3] + (1 - synthetic[..., 3:]) * plate + delta, 0).astype(np.float32)
 
 
+class TruthOptions(Protocol):
+    """What a command's options say of its truth."""
+
+    @property
+    def width(self) -> int: ...
+
+    @property
+    def samples(self) -> int: ...
+
+    @property
+    def seed(self) -> int: ...
+
+    @property
+    def cache(self) -> Path: ...
+
+
 class ReferenceStore:
     """Traces references of one scene and keeps them in ``cache``.
 
@@ -96,6 +112,13 @@ class ReferenceStore:
         self.samples = 2 * -(-samples // 2)
         self.cache, self.launcher, self.quiet = cache, launcher, quiet
         self._device_scene: DeviceScene | None = None
+
+    @classmethod
+    def of(cls, scene: Scene, options: TruthOptions, launcher: Launcher) -> ReferenceStore:
+        """The store of a command's options, pictures as high as the camera asks for."""
+        height = max(1, round(options.width / scene.camera.aspect))
+        kept = {"samples": options.samples, "seed": options.seed, "cache": options.cache}
+        return cls(scene, options.width, height, launcher=launcher, **kept)
 
     def get(self, bounces: int) -> Reference:
         """The truth with ``bounces`` indirect bounces (0 is direct light only), from the cache if it is there.

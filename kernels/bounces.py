@@ -15,7 +15,6 @@ from warp_dvct.kernels.bounce_field import (
     wall_beside,
     wall_side,
 )
-from warp_dvct.kernels.gather import World, radiosity_at
 from warp_dvct.kernels.geometry import (
     FAR,
     OFFSET_RELATIVE,
@@ -28,6 +27,7 @@ from warp_dvct.kernels.geometry import (
     trace_synthetic,
 )
 from warp_dvct.kernels.materials import Materials, Surface, hemispherical_albedo, spawn_point, surface_at
+from warp_dvct.kernels.radiosity import World, radiosity_at
 from warp_dvct.kernels.sampling import PI, cosine_hemisphere, from_frame, sobol2
 from warp_dvct.kernels.volume import Volume, brick_extent, face_of, face_weight, find_record, key_cell
 

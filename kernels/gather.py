@@ -1,9 +1,9 @@
-"""Indirect light at shading points: cones or exact rays into the radiosity volume, and guided reconstruction."""
+"""Indirect light at shading points: cones or exact rays into the radiosity volume."""
 
 import warp as wp
 
 from warp_dvct.kernels.cones import DUAL, OPAQUE, ConeSettings, march_cone
-from warp_dvct.kernels.environment import Environment, environment_radiance
+from warp_dvct.kernels.environment import environment_radiance
 from warp_dvct.kernels.gbuffer import BACKGROUND, SYNTHETIC, UNSEEN, Points, first_sample, load_surface, share_of
 from warp_dvct.kernels.geometry import (
     FAR,
@@ -21,120 +21,10 @@ from warp_dvct.kernels.materials import (
     hemispherical_albedo_specular,
     spawn_point,
 )
+from warp_dvct.kernels.radiosity import Incident, World, radiosity_at
 from warp_dvct.kernels.sampling import INV_PI, PI, cosine_hemisphere, from_frame, sobol2, uniform1
-from warp_dvct.kernels.volume import Volume, face_of, find_record
 
 wp.set_module_options({"enable_backward": False})
-
-
-FAINT = wp.constant(1.0e-6)  # coverage below which a voxel says nothing of a surface
-# Share of a face that a voxel must hold to stand alone: whole texels of a map land in slivers or miss them, so that a
-# sliver's flux stands for its surface only with its neighbours'.
-SLIVER = wp.constant(0.25)
-COARSE_FOOTPRINT = wp.constant(2.0)  # coarse voxels that a ray must cover before one of them may stand for it
-
-
-@wp.struct
-class World:
-    """What gathered rays and cones read."""
-
-    fine: Volume
-    coarse: Volume
-    has_coarse: wp.int32
-    env: Environment
-    normals: wp.array(dtype=wp.vec3)  # unit geometric normals of all triangles
-
-
-@wp.struct
-class Incident:
-    """Radiosity (pi times radiance) of the two solutions, and how far away they were met."""
-
-    before: wp.vec3
-    after: wp.vec3
-    distance_before: wp.float32
-    distance_after: wp.float32
-
-
-@wp.struct
-class FieldPair:
-    before: wp.vec4
-    after: wp.vec4
-
-
-@wp.func
-def field_pair(volume: Volume, position: wp.vec3, normal: wp.vec3) -> FieldPair:
-    """Both solutions of the level-0 faces around a surface point, trilinear, weighted by the surface's normal."""
-    local = (position - volume.low) / volume.voxel - wp.vec3(0.5, 0.5, 0.5)
-    x0 = int(wp.floor(local[0]))
-    y0 = int(wp.floor(local[1]))
-    z0 = int(wp.floor(local[2]))
-    fx = local[0] - float(x0)
-    fy = local[1] - float(y0)
-    fz = local[2] - float(z0)
-    total = FieldPair()
-    total.before = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    total.after = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    for corner in range(8):
-        dx = corner & 1
-        dy = (corner >> 1) & 1
-        dz = corner >> 2
-        record = find_record(volume, 0, x0 + dx, y0 + dy, z0 + dz)
-        if record >= 0:
-            weight = wp.where(dx == 1, fx, 1.0 - fx) * wp.where(dy == 1, fy, 1.0 - fy) * wp.where(dz == 1, fz, 1.0 - fz)
-            for axis in range(3):
-                share = wp.abs(normal[axis])
-                if share > 0.01:
-                    at = record * 12 + 2 * face_of(axis, normal[axis])
-                    total.before += (weight * share) * volume.field[at]
-                    total.after += (weight * share) * volume.field[at + 1]
-    return total
-
-
-@wp.func
-def ratio(value: wp.vec4) -> wp.vec3:
-    if value[3] <= FAINT:
-        return wp.vec3(0.0, 0.0, 0.0)
-    return wp.vec3(value[0], value[1], value[2]) / value[3]
-
-
-@wp.func
-def voxel_pair(volume: Volume, position: wp.vec3, normal: wp.vec3) -> FieldPair:
-    """As ``field_pair``, from the one level-0 voxel that holds the point."""
-    local = (position - volume.low) / volume.voxel
-    total = FieldPair()
-    total.before = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    total.after = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    record = find_record(volume, 0, int(wp.floor(local[0])), int(wp.floor(local[1])), int(wp.floor(local[2])))
-    if record >= 0:
-        for axis in range(3):
-            share = wp.abs(normal[axis])
-            if share > 0.1:
-                at = record * 12 + 2 * face_of(axis, normal[axis])
-                total.before += share * volume.field[at]
-                total.after += share * volume.field[at + 1]
-    return total
-
-
-@wp.func
-def radiosity_at(world: World, position: wp.vec3, normal: wp.vec3, footprint: float) -> Incident:
-    """Radiosity of a surface point, averaged over about ``footprint``.
-
-    Wide rays read one voxel, of the coarse volume where that is fine enough; narrow ones, and those that meet a sliver,
-    interpolate the fine volume. Where a volume holds no such surface the next one is asked.
-    """
-    pair = FieldPair()
-    if world.has_coarse != 0 and footprint > COARSE_FOOTPRINT * world.coarse.voxel:
-        pair = voxel_pair(world.coarse, position, normal)
-    elif footprint > world.fine.voxel:
-        pair = voxel_pair(world.fine, position, normal)
-    if pair.after[3] <= SLIVER:
-        pair = field_pair(world.fine, position, normal)
-    if world.has_coarse != 0 and pair.after[3] <= FAINT:
-        pair = field_pair(world.coarse, position, normal)
-    result = Incident()
-    result.before = ratio(pair.before)
-    result.after = ratio(pair.after)
-    return result
 
 
 @wp.func

@@ -5,7 +5,7 @@ import warp as wp
 from warp_dvct.kernels.bounce_field import BounceField, bounced_irradiance
 from warp_dvct.kernels.cones import ConeSettings
 from warp_dvct.kernels.environment import environment_radiance
-from warp_dvct.kernels.gather import Incident, World, cone_incident, diffuse_reflectance, ray_incident
+from warp_dvct.kernels.gather import cone_incident, diffuse_reflectance, ray_incident
 from warp_dvct.kernels.gbuffer import BACKGROUND, UNSEEN, Points, first_sample, load_surface, share_of
 from warp_dvct.kernels.geometry import (
     FAR,
@@ -25,6 +25,7 @@ from warp_dvct.kernels.materials import (
     spawn_point,
     surface_at,
 )
+from warp_dvct.kernels.radiosity import Incident, World
 from warp_dvct.kernels.sampling import INV_PI, sobol2
 from warp_dvct.kernels.shading import SHADOW_END, power_share, reflect_visible, vndf_pdf
 

@@ -15,6 +15,7 @@ from warp_dvct.bench.twins.volumes import N, fields, lit
 from warp_dvct.kernels import bounces, cones, gather, reconstruction, specular
 from warp_dvct.kernels.environment import Environment
 from warp_dvct.kernels.gbuffer import Points
+from warp_dvct.kernels.radiosity import World
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.gather import Gatherer
 from warp_dvct.passes.gbuffer import new_points
@@ -48,8 +49,8 @@ def places(launcher: Launcher, twin: Twin) -> tuple[Any, np.ndarray, np.ndarray,
 
 
 def world_of(launcher: Launcher, twin: Twin, volume: Any) -> Any:
-    """``gather.World`` of one volume and no sky."""
-    world = gather.World()
+    """``radiosity.World`` of one volume and no sky."""
+    world = World()
     world.fine = world.coarse = volume
     world.env = Environment()
     world.env.before = world.env.after = launcher.zeros(1, wp.vec3)
@@ -161,14 +162,15 @@ def measure_specular(launcher: Any) -> list[Deviation]:
 
 
 def radiosity(field: np.ndarray, place: np.ndarray, normal: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    """Of surfaces, from the voxel that holds them where a ray is wider than it, else interpolated: ``[n, sol., 3]``."""
+    """Of surfaces, ``[n, sol., 3]``: from the voxel that holds them where a ray is wider than it and a quarter of a face is
+    surface, else interpolated."""
     cell = np.clip(np.floor(place * N).astype(int), 0, N - 1)
     faces, share = faces_toward(normal), np.abs(normal)
     held = field[tuple(cell.T)][np.arange(len(cell))[:, None], faces]
     single = np.einsum("nk,nksc->nsc", share * (share > 0.1), held)
     single *= (footprint > 1.0 / N)[:, None, None]
     smooth = sample(field, place * N, faces, share * (share > 0.01))
-    pair = np.where((single[:, 1, 3] > 1e-6)[:, None, None], single, smooth)
+    pair = np.where((single[:, 1, 3] > 0.25)[:, None, None], single, smooth)
     alpha = pair[..., 3:]
     return np.where(alpha > 1e-6, pair[..., :3] / np.where(alpha > 1e-6, alpha, 1.0), 0.0)
 

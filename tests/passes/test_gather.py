@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_dvct.kernels.gather import World, radiosity_at
+from warp_dvct.kernels.radiosity import World, radiosity_at
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.gather import Gatherer, gather_all, gather_sparse, shade_indirect
 from warp_dvct.passes.gbuffer import render_gbuffer

@@ -18,7 +18,7 @@ import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kept import Kept, content_key
-from warp_dvct.kernels import cones, gather, shading, specular
+from warp_dvct.kernels import cones, radiosity, shading, specular
 from warp_dvct.kernels.volume import Volume
 from warp_dvct.launch import Launcher
 from warp_dvct.layers import Radiance
@@ -52,7 +52,7 @@ class LightField:
     """The lit volumes, which depend on geometry and lights but not on the camera.
 
     Attributes:
-        world: ``kernels.gather.World``, as gathering kernels take it.
+        world: ``kernels.radiosity.World``, as gathering kernels take it.
         volumes: The voxels behind it, fine first; empty where the plan needs none.
         bounces: ``BounceField``, the irradiance of second and further bounces.
     """
@@ -225,7 +225,7 @@ def _voxelize(
 
 
 def _world(launcher: Launcher, scene: Scene, normals: Any, volumes: list[Voxels]) -> Any:
-    world = gather.World()
+    world = radiosity.World()
     world.fine = volumes[0].volume if volumes else _no_volume(launcher)
     world.has_coarse = int(len(volumes) > 1)
     world.coarse = volumes[1].volume if len(volumes) > 1 else world.fine

@@ -156,7 +156,7 @@ def solve_bounces(
     """Irradiance of patches from bounces 1 … ``bounces``, before and after: vec3 ``[patches * 2]``.
 
     Args:
-        world: ``kernels.gather.World`` whose volumes hold directly lit radiosity.
+        world: ``kernels.radiosity.World`` whose volumes hold directly lit radiosity.
         rays: Cosine-distributed rays per patch; they are traced once.
         kept: Holds what these rays met in the real scene from frame to frame, patch by patch.
     """
