@@ -162,8 +162,8 @@ def measure_specular(launcher: Any) -> list[Deviation]:
 
 
 def radiosity(field: np.ndarray, place: np.ndarray, normal: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    """Of surfaces, ``[n, sol., 3]``: from the voxel that holds them where a ray is wider than it and a quarter of a face
-    is surface, else interpolated."""
+    """Of surfaces, ``[n, sol., 3]``: from the voxel that holds them, where a ray is wider than it and a quarter of a
+    face is surface; else interpolated."""
     cell = np.clip(np.floor(place * N).astype(int), 0, N - 1)
     faces, share = faces_toward(normal), np.abs(normal)
     held = field[tuple(cell.T)][np.arange(len(cell))[:, None], faces]
