@@ -15,6 +15,7 @@ from warp_dvct.bench.twins.volumes import N, fields, lit
 from warp_dvct.kernels import bounces, cones, gather, reconstruction, specular
 from warp_dvct.kernels.environment import Environment
 from warp_dvct.kernels.gbuffer import Points
+from warp_dvct.kernels.patches import Patches
 from warp_dvct.kernels.radiosity import World
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.gather import Gatherer
@@ -235,7 +236,7 @@ def measure_bounces(launcher: Any) -> list[Deviation]:
     link = rng.integers(-1, count, (count, RAYS, 2)).astype(np.int32)
     albedo, irradiance = rng.uniform(0, 1, (count, 3)), rng.uniform(0, 9, (count, 2, 3))
     real = rng.integers(0, 2, count).astype(np.int32)
-    patches = bounces.Patches()
+    patches = Patches()
     patches.albedo = launcher.array(albedo.astype(np.float32), wp.vec3)
     patches.real = launcher.array(real, wp.int32)
     last = launcher.array(irradiance.reshape(-1, 3).astype(np.float32), wp.vec3)

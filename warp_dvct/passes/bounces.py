@@ -10,6 +10,7 @@ import warp as wp
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kept import Kept
 from warp_dvct.kernels import bounces as kernels
+from warp_dvct.kernels import patches as patch_kernels
 from warp_dvct.kernels.bounce_field import BounceField
 from warp_dvct.kernels.sorting import EMPTY_KEY
 from warp_dvct.kernels.volume import Volume
@@ -27,7 +28,7 @@ class Patches:
 
     Attributes:
         voxels: The volume they were taken from. level, level_first: Its level, and that level's first record.
-        data: ``kernels.Patches``. count: How many.
+        data: ``kernels.patches.Patches``. count: How many.
         table: int ``[records of the level * 6]``, patch of a face or -1.
         walls: vec4 ``[records of the level]``, planes of thin walls or 0. has_walls: Whether there are any.
         patch_walls: vec4 ``[count]``, of the walls beside patches.
@@ -78,7 +79,7 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
     key = launcher.empty(max(1, 12 * records), wp.int32)
     order = launcher.empty(max(1, 12 * records), wp.int32)
     launcher.launch(
-        kernels._face_keys,
+        patch_kernels._face_keys,
         6 * records,
         [voxels.level_keys[0], voxels.area, voxels.volume, level, level_first, int(EMPTY_KEY)],
         [key],
@@ -86,14 +87,14 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
     sort_by_key(launcher, key, order, 6 * records)
     keys, starts = unique_runs(launcher, key, 6 * records)
     count = keys.shape[0]
-    data = kernels.Patches()
+    data = patch_kernels.Patches()
     data.position, data.normal, data.albedo = (launcher.zeros(max(1, count), wp.vec3) for _ in range(3))
     data.reach, data.area = (launcher.zeros(max(1, count), wp.float32) for _ in range(2))
     data.real = launcher.zeros(max(1, count), wp.int32)
     data.place = launcher.zeros(max(1, count), wp.int64)
     table = launcher.full(max(1, 6 * voxels.level_records[level]), -1, wp.int32)
     launcher.launch(
-        kernels._choose_patches,
+        patch_kernels._choose_patches,
         count,
         [
             scene.geometry,
@@ -115,7 +116,7 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
     walls = launcher.zeros(max(1, voxels.level_records[level]), wp.vec4)
     found = launcher.zeros(max(1, voxels.level_records[level]), wp.int32)
     launcher.launch(
-        kernels._find_walls,
+        patch_kernels._find_walls,
         voxels.level_records[level],
         [voxels.volume, level, level_first, voxels.level_keys[level], data, table],
         [walls, found],
@@ -124,14 +125,14 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
     patches = Patches(voxels, level, level_first, data, count, table, walls, bool(found.numpy().any()), beside)
     if patches.has_walls:
         launcher.launch(
-            kernels._wall_of_patches, count, [data, bounce_field(launcher, patches, data.position)], [beside]
+            patch_kernels._wall_of_patches, count, [data, bounce_field(launcher, patches, data.position)], [beside]
         )
     return patches
 
 
 def _fragments(voxels: Voxels) -> Any:
-    """``kernels.Fragments`` of a volume."""
-    pieces, out = voxels.fragments, kernels.Fragments()
+    """``kernels.patches.Fragments`` of a volume."""
+    pieces, out = voxels.fragments, patch_kernels.Fragments()
     out.count, out.records = pieces.count, voxels.level_records[0]
     out.record_start, out.order, out.triangle, out.place = (
         pieces.record_start,
