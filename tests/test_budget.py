@@ -215,7 +215,7 @@ def test_a_fit_finds_the_units_that_made_the_samples(surveys):
             for ladder in LADDERS:
                 knobs |= ladder.settings(ladder.values[rng.integers(min(5, len(ladder.values)))])
             work = count_work(make_settings("balanced", knobs), found, int(rng.choice([160, 320])), 180)
-            cpu = {name: truth._cost(name, counts) * rng.uniform(0.9, 1.1) for name, counts in work.items()}
+            cpu = {name: truth.cpu_seconds({name: counts}) * rng.uniform(0.9, 1.1) for name, counts in work.items()}
             wall = {name: value / truth.speedup.get(name, 1.0) for name, value in cpu.items()}
             samples.append(Sample(work, cpu, wall))
     model = fit(samples, device="cpu", threads=2, machine="made")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -122,13 +123,17 @@ class Accuracy:
         """Mean LDR-FLIP of the picture against many bounces."""
         if not survey.changes:
             return 0.0
+        found = [self.excess(ladder.knob, settings, survey, method) for ladder in LADDERS_OF[method]]
+        return self.reference(survey, width, method) * math.sqrt(self.combined(found))
+
+    def combined(self, excesses: Iterable[float]) -> float:
+        """Squared FLIP over that at the reference, of settings whose knobs one by one exceed it by these."""
         factor, added = 1.0, 0.0
-        for ladder in LADDERS_OF[method]:
-            excess = self.excess(ladder.knob, settings, survey, method)
+        for excess in excesses:
             # Independent errors add up; what improves takes a share off the reference's own, and these overlap.
             added += max(excess, 0.0)
             factor *= 1.0 + min(excess, 0.0)
-        return self.reference(survey, width, method) * math.sqrt(factor ** self.base["overlap"] + added)
+        return factor ** self.base["overlap"] + added
 
     def excess(self, knob: str, settings: Settings, survey: Survey, method: str = "delta-cones") -> float:
         """Of squared FLIP over that at the reference, where only ``knob`` is as in ``settings``."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from warp_dvct.accuracy import DETAIL, FILLED, LADDERS_OF, Accuracy, Ladder, load_accuracy, matters
-from warp_dvct.cost import CostModel, Counts, count_survey, count_work
+from warp_dvct.cost import CostModel, Counts, count_survey, count_work, price
 from warp_dvct.cost_vpls import count_vpl_work
 from warp_dvct.errors import OptionError
 from warp_dvct.passes.gather import FINEST
@@ -136,6 +136,9 @@ class _Chooser:
             if matters(x.knob, survey) and not any(k in fixed for k in x.settings(x.values[0]))
         ]
         self.planning = {"survey": count_survey(survey)}
+        self.prices = model.clock_units(threads)
+        self.reference = accuracy.reference(survey, width, method) if survey.changes else 0.0
+        self.excesses: dict[tuple[str, float, float], float] = {}
 
     def _required(self, ladder: Ladder) -> Ladder:
         """Without voxels that are too large for the objects: no error that the table knows shows that."""
@@ -153,7 +156,7 @@ class _Chooser:
 
     def seconds(self, settings: Settings) -> float:
         """Of the clock, the survey included."""
-        return self.model.seconds(self.work(settings), self.threads)
+        return price(self.work(settings), self.prices)
 
     def work(self, settings: Settings) -> dict[str, Counts]:
         """What a frame and its planning take."""
@@ -161,8 +164,18 @@ class _Chooser:
         return count(settings, self.survey, self.width, self.height) | self.planning
 
     def square(self, settings: Settings) -> float:
-        """Predicted squared FLIP."""
-        return self.accuracy.error(settings, self.survey, self.width, self.method) ** 2
+        """Predicted squared FLIP, as ``Accuracy.error``: a search asks for each value of a knob a hundred times."""
+        if not self.survey.changes:
+            return 0.0
+        found = (self.excess(ladder.knob, settings) for ladder in LADDERS_OF[self.method])
+        return self.reference**2 * self.accuracy.combined(found)
+
+    def excess(self, knob: str, settings: Settings) -> float:
+        """As ``Accuracy.excess``, looked up once."""
+        key = knob, getattr(settings, NAMES[knob]), settings.gather_detail
+        if key not in self.excesses:
+            self.excesses[key] = self.accuracy.excess(knob, settings, self.survey, self.method)
+        return self.excesses[key]
 
     def choose(self, budget: float | None, max_error: float | None) -> Choice:
         state = {ladder.knob: ladder.values[0] for ladder in self.ladders}

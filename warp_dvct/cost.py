@@ -14,11 +14,13 @@ import os
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from warp_dvct.errors import FileError, OptionError
+from warp_dvct.gather_need import GatherNeed
 from warp_dvct.image import write_text
 from warp_dvct.settings import Settings
 from warp_dvct.survey import MapNeed, Survey, VolumeNeed
@@ -197,13 +199,11 @@ def _gather(settings: Settings, survey: Survey, width: int, height: int, edges: 
     real, on_object = survey.on_real, survey.on_object
     pixels = width * height * 1e-6
     on_edges = survey.edge.object * edges
-    first, again = real.need.points(settings.gather_stride, width, height, detail)
-    alone, at_edges = real.need.alone(settings.gather_stride, width, detail)
+    first, again, alone, at_edges = _points(real.need, settings.gather_stride, width, height, detail)
     again += 1e6 * (alone * survey.real * pixels + at_edges * (edges - on_edges))
     add(first, settings.gather_rays, real.met, real.entered)
     add(again, settings.gather_rays, real.met, real.entered_again)
-    first, again = on_object.need.points(settings.gather_object_stride, width, height, detail)
-    alone, at_edges = on_object.need.alone(settings.gather_object_stride, width, detail)
+    first, again, alone, at_edges = _points(on_object.need, settings.gather_object_stride, width, height, detail)
     again += 1e6 * (alone * survey.object * pixels + at_edges * on_edges)
     add(first + again, settings.gather_object_rays, on_object.met, on_object.entered)
     if not survey.plate:
@@ -212,6 +212,12 @@ def _gather(settings: Settings, survey: Survey, width: int, height: int, edges: 
         add(hidden, max(1, settings.gather_rays // 4), real.met, real.entered_again)
     blocks = pixels / settings.gather_stride**2 + pixels / settings.gather_object_stride**2
     return {"frame": 1, "points": pixels + edges, "blocks": blocks, **counts}
+
+
+@lru_cache(maxsize=512)
+def _points(need: GatherNeed, stride: int, width: int, height: int, detail: float) -> tuple[float, float, float, float]:
+    """``GatherNeed.points`` and ``alone``, which a search for settings asks for again and again."""
+    return *need.points(stride, width, height, detail), *need.alone(stride, width, detail)
 
 
 @dataclass(frozen=True)
@@ -236,23 +242,23 @@ class CostModel:
 
     def seconds(self, work: Mapping[str, Counts], threads: int) -> float:
         """Seconds of the clock that a frame takes with a number of threads."""
-        return sum(self.by_pass(work, threads).values())
+        return price(work, self.clock_units(threads))
 
     def cpu_seconds(self, work: Mapping[str, Counts]) -> float:
         """Processor seconds of a frame."""
-        return sum(self._cost(name, counts) for name, counts in work.items())
+        return price(work, self.units)
 
     def by_pass(self, work: Mapping[str, Counts], threads: int) -> dict[str, float]:
         """Seconds of the clock by pass."""
-        found = {}
-        for name, counts in work.items():
-            alone = self._cost(name, {unit: n for unit, n in counts.items() if unit in SERIAL})
-            found[name] = alone + (self._cost(name, counts) - alone) / self._gain(name, threads)
-        return found
+        units = self.clock_units(threads)
+        return {name: price({name: counts}, units) for name, counts in work.items()}
 
-    def _cost(self, name: str, counts: Counts) -> float:
-        units = self.units.get(name, {})
-        return sum(units.get(unit, 0.0) * count for unit, count in counts.items())
+    def clock_units(self, threads: int) -> dict[str, Counts]:
+        """As ``units``, by the clock with a number of threads."""
+        return {
+            name: {unit: cost if unit in SERIAL else cost / self._gain(name, threads) for unit, cost in units.items()}
+            for name, units in self.units.items()
+        }
 
     def _gain(self, name: str, threads: int) -> float:
         """Of what is not ``SERIAL``. Amdahl: the part that runs on one thread follows from the measured gain."""
@@ -261,6 +267,17 @@ class CostModel:
             return 1.0
         serial = (self.threads / min(measured, float(self.threads)) - 1.0) / (self.threads - 1.0)
         return 1.0 / (serial + (1.0 - serial) / threads)
+
+
+def price(work: Mapping[str, Counts], units: Mapping[str, Counts]) -> float:
+    """Seconds of all passes' counts, given those of a unit by pass."""
+    total = 0.0
+    for name, counts in work.items():
+        costs = units.get(name)
+        if costs:
+            for unit, cost in costs.items():
+                total += cost * counts.get(unit, 0.0)
+    return total
 
 
 @dataclass(frozen=True)
