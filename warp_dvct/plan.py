@@ -18,6 +18,8 @@ MOST_BEYOND = 0.05  # share of the directions around the objects that may meet s
 MAP_BYTES = 80  # of a texel of an RSM pair
 RECORD_BYTES = 12 * 16
 POINT_BYTES = 120
+LAYERED_PIXEL_BYTES = 100  # of the finished layers and what they are made of
+TRACED_PIXEL_BYTES = 168  # of path tracing: float64 sums, and the picture with its guides
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,11 @@ def make_plan(
     glossy = _is_glossy(scene, settings)
     changes = synthetic is not None or added
     if method == "path-trace":
-        passes = (PassPlan("path trace", True, f"{settings.samples} samples a pixel, {settings.bounces} bounces"),)
+        why = f"{settings.samples} samples a pixel, {settings.bounces} bounces"
+        passes = (
+            PassPlan("path trace", True, why, width * height * TRACED_PIXEL_BYTES),
+            PassPlan("composite", True, "layers and the finished picture", width * height * LAYERED_PIXEL_BYTES),
+        )
     elif method == "instant-radiosity":
         from warp_dvct.plan_instant_radiosity import plan_passes
 
@@ -344,6 +350,6 @@ def _passes(
             not has_plate,
             "no plate: the real scene is rendered as one" if not has_plate else "a plate is given",
         ),
-        PassPlan("composite", True, "layers and the finished picture", pixels * 100),
+        PassPlan("composite", True, "layers and the finished picture", pixels * LAYERED_PIXEL_BYTES),
     ]
     return tuple(passes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from warp_dvct.passes.vpl_memory import CLOUD_BYTES, VPL_BYTES, map_texels, vpl_count
-from warp_dvct.plan import MAP_BYTES, POINT_BYTES, PassPlan
+from warp_dvct.plan import LAYERED_PIXEL_BYTES, MAP_BYTES, POINT_BYTES, PassPlan
 from warp_dvct.scene import LightKind, Scene
 from warp_dvct.settings import Settings
 
@@ -88,7 +88,7 @@ def plan_passes(
             "by rays" if lit and glossy else "no material has a specular lobe smoother than glossy.roughness",
         ),
         _before(settings, has_plate),
-        PassPlan("composite", True, "layers and the finished picture", pixels * 100),
+        PassPlan("composite", True, "layers and the finished picture", pixels * LAYERED_PIXEL_BYTES),
     )
 
 

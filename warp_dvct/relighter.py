@@ -15,6 +15,7 @@ from warp_dvct.errors import OptionError
 from warp_dvct.kept import Kept, content_key
 from warp_dvct.launch import Launcher
 from warp_dvct.layers import Layers, Radiance
+from warp_dvct.memory import require_countable, require_memory
 from warp_dvct.methods import delta_cone_tracing, instant_radiosity, path_tracing
 from warp_dvct.passes.composite import composite
 from warp_dvct.passes.difference import tonemap_difference
@@ -190,6 +191,7 @@ class Relighter:
         self._had_plate = plate is not None
         if self._planned_plate != self._had_plate:
             self._plan(has_plate=self._had_plate)
+        require_memory(self.plan, launcher.device)
         if self.method == "path-trace":
             radiance = self._path_trace(report)
         elif self.method == "instant-radiosity":
@@ -244,8 +246,7 @@ class Relighter:
             width = self._default_width() if height is None else max(1, round(height * aspect))
         if height is None:
             height = max(1, round(width / aspect))
-        if width < 1 or height < 1:
-            raise OptionError(f"the picture is {width} x {height}; give sizes of at least 1 pixel")
+        require_countable(width, height)
         return width, height
 
     def _default_width(self) -> int:

@@ -80,6 +80,14 @@ def test_settings(command, room, out):
     assert not list(out.iterdir())
 
 
+def test_pictures_that_no_machine_holds(command, room, out):
+    """Counted beyond 32 bits, or larger than the memory: refused before anything is rendered."""
+    refuse(command("relight", room, out / "a.exr", "-w", 10**8), 1, "100000000 x 56250000", "--imageWidth")
+    if os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") < 20 * 2**30:
+        refuse(command("relight", room, out / "a.exr", "-w", 21840), 1, "21840 x 12285", "GiB", "--imageWidth")
+    assert not list(out.iterdir())
+
+
 def test_absent_devices_are_named_with_those_present(command, room, out):
     refuse(command("relight", room, out / "a.exr", "--device", "cuda:99"), 1, "cuda:99", "cpu")
     refuse(command("warmup", "--device", "gpu"), 1, "gpu", "cpu")
