@@ -23,7 +23,7 @@ from warp_dvct.errors import FileError, OptionError
 from warp_dvct.gather_need import GatherNeed
 from warp_dvct.image import write_text
 from warp_dvct.settings import Settings
-from warp_dvct.survey import MapNeed, Survey, VolumeNeed
+from warp_dvct.survey import MapNeed, PointNeed, Survey, VolumeNeed
 
 DEFAULT_FILE = Path(__file__).with_name("cost.json")
 REST = "rest"  # of a frame's time, what is in no pass
@@ -183,35 +183,46 @@ def _specular(settings: Settings, survey: Survey, pixels: float, edges: float) -
 
 
 def _gather(settings: Settings, survey: Survey, width: int, height: int, edges: float) -> Counts:
-    """Rays by what they cost: all descend the real tree, some the synthetic one, some read voxels."""
-    counts = dict.fromkeys(("gathered", "rays", "met", "real deep", "synthetic deep", "focused"), 0.0)
-    detail = settings.gather_detail
-
-    def add(points: float, rays: int, met: float, entered: float) -> None:
-        traced = 1e-6 * points * (rays + FIRST_RAYS * math.sqrt(rays))
-        counts["gathered"] += 1e-6 * points
-        counts["rays"] += traced
-        counts["met"] += traced * met
-        counts["real deep"] += traced * math.log2(2.0 + survey.real_triangles)
-        counts["synthetic deep"] += traced * entered * math.log2(2.0 + survey.synthetic_triangles)
-        counts["focused"] += traced * float(survey.focuses)
-
+    """Rays of all gathered points, and what is done with them."""
     real, on_object = survey.on_real, survey.on_object
-    pixels = width * height * 1e-6
-    on_edges = survey.edge.object * edges
-    first, again, alone, at_edges = _points(real.need, settings.gather_stride, width, height, detail)
+    pixels, on_edges = width * height * 1e-6, survey.edge.object * edges
+    detail, stride, object_stride = settings.gather_detail, settings.gather_stride, settings.gather_object_stride
+    first, again, alone, at_edges = _points(real.need, stride, width, height, detail)
     again += 1e6 * (alone * survey.real * pixels + at_edges * (edges - on_edges))
-    add(first, settings.gather_rays, real.met, real.entered)
-    add(again, settings.gather_rays, real.met, real.entered_again)
-    first, again, alone, at_edges = _points(on_object.need, settings.gather_object_stride, width, height, detail)
+    counts = gathered(survey, real, first, settings.gather_rays)
+    _add(counts, gathered(survey, real, again, settings.gather_rays, entered=real.entered_again))
+    first, again, alone, at_edges = _points(on_object.need, object_stride, width, height, detail)
     again += 1e6 * (alone * survey.object * pixels + at_edges * on_edges)
-    add(first + again, settings.gather_object_rays, on_object.met, on_object.entered)
+    _add(counts, gathered(survey, on_object, first + again, settings.gather_object_rays))
     if not survey.plate:
         # Real surfaces behind the objects are gathered point by point, with a quarter of the rays.
         hidden = 1e6 * (survey.object * pixels + on_edges)
-        add(hidden, max(1, settings.gather_rays // 4), real.met, real.entered_again)
-    blocks = pixels / settings.gather_stride**2 + pixels / settings.gather_object_stride**2
+        _add(counts, gathered(survey, real, hidden, max(1, settings.gather_rays // 4), entered=real.entered_again))
+    blocks = pixels / stride**2 + pixels / object_stride**2
     return {"frame": 1, "points": pixels + edges, "blocks": blocks, **counts}
+
+
+def gathered(survey: Survey, where: PointNeed, points: float, rays: int, *, entered: float | None = None) -> Counts:
+    """Rays of points by what they cost: all descend the real tree, some the synthetic one, some read voxels.
+
+    Args:
+        entered: Share of the rays that pass the objects' box, where it is not that of all points.
+    """
+    traced = 1e-6 * points * (rays + FIRST_RAYS * math.sqrt(rays))
+    entered = where.entered if entered is None else entered
+    return {
+        "gathered": 1e-6 * points,
+        "rays": traced,
+        "met": traced * where.met,
+        "real deep": traced * math.log2(2.0 + survey.real_triangles),
+        "synthetic deep": traced * entered * math.log2(2.0 + survey.synthetic_triangles),
+        "focused": traced * float(survey.focuses),
+    }
+
+
+def _add(counts: Counts, more: Counts) -> None:
+    for unit, count in more.items():
+        counts[unit] += count
 
 
 @lru_cache(maxsize=512)
