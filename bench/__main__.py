@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from warp_dvct.bench.check_commands import CHECK_COMMANDS
-from warp_dvct.bench.options import settings_of, shared, write_json
+from warp_dvct.bench.options import Target, settings_of, shared, write_json
 from warp_dvct.bench.trade_commands import TRADE_COMMANDS
 from warp_dvct.cli.quiet import start_warp
 from warp_dvct.errors import DvctError
@@ -56,7 +56,9 @@ def error(
 @bench.command()
 @click.option("--stage", "stages", multiple=True, help="A bundled stage or a USD file; repeatable. Default: room_area.")
 @click.option("--quality", default="balanced", show_default=True)
-@click.option("--width", type=int, default=96, show_default=True, help="Pixels across; one point per pixel.")
+@click.option(
+    "--width", type=click.IntRange(min=1), default=96, show_default=True, help="Pixels across; one point per pixel."
+)
 @shared
 def eq9(stages: tuple[str, ...], pairs: tuple[str, ...], json_file: Path | None, **rest: Any) -> None:
     """The paper's eq. 9: error of the delta formulation, for our cones and for the paper's."""
@@ -191,7 +193,7 @@ def compare(stage: str, texts: tuple[str, ...], spp: int, pairs: tuple[str, ...]
 @click.option("--cache", type=click.Path(path_type=Path), help="References; default: warp_dvct in the user's cache.")
 @click.option("--device", default="cpu", show_default=True, help="Of our methods: cpu or cuda:N.")
 @click.option("--threads", type=int, help="CPU threads; all cores by default. The denoiser takes all.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file too.")
+@click.option("--json", "json_file", type=Target(), help="Write the figures to this file too.")
 def peers(stages: tuple[str, ...], spp: int, cache: Path | None, json_file: Path | None, **rest: Any) -> None:
     """Beside Mitsuba 3 with and without Intel's denoiser: error against our truth, seconds in the same run."""
     start_warp(rest["device"])
@@ -256,7 +258,7 @@ def motion(stage: str, pairs: tuple[str, ...], json_file: Path | None, spp: int,
 @click.option("--live", type=click.Path(path_type=Path), help="A dataset's folder: relit from live depth as well.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda:N.")
 @click.option("--threads", type=int, help="CPU threads; all cores by default.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file too.")
+@click.option("--json", "json_file", type=Target(), help="Write the figures to this file too.")
 def reconstruct(stage: str, json_file: Path | None, **rest: Any) -> None:
     """A simulated capture: time a frame of filter, fusion and tracking, and how near the reconstruction comes."""
     start_warp(rest["device"])

@@ -10,7 +10,27 @@ import click
 
 from warp_dvct.bench.rows import plain
 from warp_dvct.errors import OptionError
-from warp_dvct.image import write_text
+from warp_dvct.image import check_writable, write_text
+
+
+class Target(click.Path):
+    """A file to be written; where that cannot be is found out before the minutes of work."""
+
+    def __init__(self, *endings: str) -> None:
+        super().__init__(path_type=Path)
+        self._endings = endings
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Refuse an ending that is not among ``endings``.
+
+        Raises:
+            FileError: The file is a folder, or the one around it is missing or cannot be written.
+        """
+        file = Path(value)
+        if self._endings and file.suffix.lower() not in self._endings:
+            self.fail(f"'{file}' has to end in {' or '.join(self._endings)}", param, ctx)
+        check_writable(file)
+        return file
 
 
 def shared(command: Any) -> Any:
@@ -19,9 +39,7 @@ def shared(command: Any) -> Any:
         click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="A setting, as in warp-dvct relight."),
         click.option("--device", default="cpu", show_default=True, help="cpu or cuda:N."),
         click.option("--threads", type=int, help="CPU threads; all cores by default."),
-        click.option(
-            "--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file too."
-        ),
+        click.option("--json", "json_file", type=Target(), help="Write the figures to this file too."),
     ):
         command = option(command)
     return command

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import shlex
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import click
 
-from warp_dvct.bench.options import settings_of
+from warp_dvct.bench.options import Target, settings_of
 from warp_dvct.cli.options import METHODS, QUALITIES
 from warp_dvct.cli.quiet import start_warp
 from warp_dvct.usd_scenes import cache_folder
@@ -18,7 +19,15 @@ FILE = click.Path(path_type=Path)
 
 @click.command()
 @click.option("--stage", "stages", multiple=True, help="A bundled stage or a USD file; repeatable. Default: room_area.")
-@click.option("--method", type=click.Choice(METHODS), default="delta-cones", show_default=True)
+@click.option(
+    "--method",
+    "methods",
+    type=click.Choice(METHODS),
+    multiple=True,
+    default=("delta-cones",),
+    show_default=True,
+    help="Repeatable.",
+)
 @click.option("--quality", type=click.Choice(QUALITIES), default="balanced", show_default=True)
 @click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="A setting, as in warp-dvct relight.")
 @click.option("--width", type=click.IntRange(min=1), default=640, show_default=True, help="Pixels across.")
@@ -28,7 +37,7 @@ FILE = click.Path(path_type=Path)
 @click.option("--threads", type=int, multiple=True, help="Of the CPU; repeatable. Default: 1, 2, 4, … all.")
 @click.option("--out", "out", type=FILE, metavar="FILE", help="Add the rows to this file of JSON lines.")
 @click.option("--compare", "files", type=FILE, nargs=2, metavar="OLD NEW", help="Compare two such files, and stop.")
-def backends(stages: tuple[str, ...], pairs: tuple[str, ...], devices, threads, out: Path | None, files, **rest: Any):
+def backends(stages: tuple[str, ...], methods, pairs: tuple[str, ...], devices, threads, out, files, **rest: Any):
     """The same picture on the CPU with 1, 2, … threads and on each GPU: seconds, bytes, and whether they agree."""
     from warp_dvct.bench import backends as module
     from warp_dvct.bench.rows import append_row, provenance, read_rows
@@ -40,9 +49,10 @@ def backends(stages: tuple[str, ...], pairs: tuple[str, ...], devices, threads, 
     start_warp("cpu")
     if out is not None:
         read_rows(out)  # a broken file is found before the work
-    options = module.BackendOptions(settings=settings_of(pairs), **rest)
+    settings = settings_of(pairs)
     found, taken = module.find_backends(devices, threads), provenance()
-    for stage in stages or ("room_area",):
+    for stage, method in product(stages or ("room_area",), dict.fromkeys(methods)):
+        options = module.BackendOptions(method=method, settings=settings, **rest)
         rows = [{**row, **taken} for row in module.measure(stage, found, options)]
         click.echo(module.format_rows(rows) + "\n")
         if out is not None:
@@ -217,12 +227,14 @@ def effects(cache: Path | None, out: Path | None, **rest: Any) -> None:
 
 
 @click.command()
-@click.argument("file", type=FILE)
-@click.option("--width", type=int, default=240, show_default=True, help="Pixels across of each panel.")
+@click.argument("file", type=Target(".png", ".jpg", ".jpeg", ".svg"))
+@click.option(
+    "--width", type=click.IntRange(min=1), default=240, show_default=True, help="Pixels across of each panel."
+)
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda:N.")
 @click.option("--threads", type=int, help="CPU threads; all cores by default.")
 def figure3(file: Path, width: int, device: str, threads: int | None) -> None:
-    """The paper's figure 3 from our own renders, into FILE (.png or .jpg): where the delta formulation is wrong."""
+    """The paper's figure 3 from our own renders, into FILE (.png, .jpg, .svg): where deltas are wrong."""
     start_warp(device)
     from warp_dvct.bench import figure3 as module
     from warp_dvct.launch import Launcher
@@ -252,6 +264,8 @@ def _some_rows(file: Path, kind: str) -> list[dict[str, Any]]:
     from warp_dvct.bench.rows import read_rows
     from warp_dvct.errors import FileError
 
+    if not file.is_file():
+        raise FileError(f"{file} does not exist or is not a file; check the path")
     rows = read_rows(file, kind)
     if not rows:
         raise FileError(f"{file} has no rows of kind '{kind}'; write some with --out")

@@ -9,7 +9,7 @@ from warp_dvct.errors import DeviceError, OptionError
 from warp_dvct.plan import Plan
 
 MAX_PIXELS = 2**28  # 16384 x 16384; kernels count the values of a picture in 32 bits
-PICTURE_PASSES = ("gbuffer", "path trace", "composite")  # whose memory goes by the pixels alone, so that the plan knows it
+PICTURE_PASSES = ("gbuffer", "path trace", "composite")  # whose memory goes by the pixels alone
 
 
 def require_countable(width: int, height: int) -> None:

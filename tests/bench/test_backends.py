@@ -157,6 +157,16 @@ def test_two_backends_of_a_tiny_room(tmp_path):
     assert "faster" not in result.output
 
 
+def test_each_method_on_each_backend(tmp_path):
+    """Methods repeat like stages; every row says which it is of."""
+    file = tmp_path / "rows.jsonl"
+    small = ["--width", "16", "--runs", "2", "--threads", "1", "--quality", "draft", "--set", "vpls.count=16"]
+    methods = ["--method", "path-trace", "--method", "instant-radiosity", "--set", "samples=1"]
+    result = CliRunner().invoke(bench, ["backends", *small, *methods, "--out", str(file)], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert [r["method"] for r in read_rows(file, "backends")] == ["path-trace", "instant-radiosity"]
+
+
 def test_unusable_numbers(tmp_path):
     with pytest.raises(OptionError, match="--runs is 1"):
         module.measure("room_area", [module.Backend("cpu")], module.BackendOptions(runs=1))
@@ -165,6 +175,8 @@ def test_unusable_numbers(tmp_path):
     (tmp_path / "a.jsonl").write_text("")
     result = CliRunner().invoke(bench, ["backends", "--compare", str(tmp_path / "a.jsonl"), str(tmp_path / "a.jsonl")])
     assert isinstance(result.exception, FileError)
+    result = CliRunner().invoke(bench, ["backends", "--compare", str(tmp_path / "b.jsonl"), str(tmp_path / "a.jsonl")])
+    assert "b.jsonl does not exist" in str(result.exception)
 
 
 @pytest.mark.parametrize("words", [["warp-dvct", "bench"], ["python", "-m", "warp_dvct.bench"]])
