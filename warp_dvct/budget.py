@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from warp_dvct.accuracy import DETAIL, FILLED, LADDERS_OF, Accuracy, Ladder, load_accuracy, matters
+from warp_dvct.accuracy import DETAIL, FILLED, LADDERS_OF, RAYS, Accuracy, Ladder, load_accuracy, matters
 from warp_dvct.cost import CostModel, Counts, count_survey, count_work, price
 from warp_dvct.cost_vpls import count_vpl_work
 from warp_dvct.errors import OptionError
+from warp_dvct.pace import RAYS_SET, Pace
 from warp_dvct.passes.gather import FINEST
 from warp_dvct.settings import NAMES, Settings, make_settings
 from warp_dvct.survey import Survey
@@ -37,6 +38,7 @@ class Choice:
         floor: Seconds of the cheapest choice. fixed: Settings that the user gave.
         reasons: Lines for people: what was chosen, what was left out and why.
         enough: Whether more time would buy nothing that shows, so that some of the budget is left.
+        pace: Settles the rays of the first frame by the time that is left then; None where they are not for it to say.
     """
 
     method: str
@@ -48,6 +50,7 @@ class Choice:
     fixed: tuple[str, ...]
     reasons: tuple[str, ...]
     enough: bool = False
+    pace: Pace | None = field(default=None, compare=False)
 
     def describe(self) -> str:
         """Some lines for a terminal."""
@@ -61,6 +64,9 @@ class Choice:
         chosen = {name: getattr(self.settings, NAMES[name]) for ladder in ladders for name in ladder.settings(1)}
         if self.method == "path-trace":
             chosen = {"samples": self.settings.samples}
+        settled = self.pace.settled if self.pace is not None else None
+        if settled is not None:
+            chosen |= {name: settled.rays for name in RAYS_SET}
         return {
             "seconds": self.seconds,
             "cpu_seconds": self.cpu_seconds,
@@ -68,6 +74,7 @@ class Choice:
             "floor": self.floor,
             "enough": self.enough,
             "chosen": chosen,
+            "settled": None if settled is None else asdict(settled),
             "reasons": list(self.reasons),
         }
 
@@ -196,10 +203,24 @@ class _Chooser:
         enough = False
         if max_error is not None:
             state = self._cheapest([state, last], max_error)
+        pace = None
         if budget is not None:
             state, enough = self._fill(state, aim)
             stopped = "more would not show" if enough else "the time is used up"
-        return self._choice(state, floor, stopped, enough=enough)
+            pace = self._pace(state, aim, enough=enough)
+        return replace(self._choice(state, floor, stopped, enough=enough), pace=pace)
+
+    def _pace(self, state: Mapping[str, float], aim: float, *, enough: bool) -> Pace | None:
+        """What keeps a frame to its time by rays, where rays are chosen."""
+        if RAYS not in state or self.base.gather != "rays" or "gather" not in self.work(self.settings(state)):
+            return None
+        least = int(next(x for x in self.ladders if x.knob == RAYS).values[0])
+        most = int(state[RAYS]) if enough else MOST[RAYS]
+
+        def count(settings: Settings) -> dict[str, Counts]:
+            return count_work(settings, self.survey, self.width, self.height)
+
+        return Pace(self.survey, self.width, self.height, aim, self.prices, count, least, most)
 
     def _climb(
         self, state: dict[str, float], aim: float, max_error: float | None

@@ -185,21 +185,30 @@ def _specular(settings: Settings, survey: Survey, pixels: float, edges: float) -
 def _gather(settings: Settings, survey: Survey, width: int, height: int, edges: float) -> Counts:
     """Rays of all gathered points, and what is done with them."""
     real, on_object = survey.on_real, survey.on_object
-    pixels, on_edges = width * height * 1e-6, survey.edge.object * edges
-    detail, stride, object_stride = settings.gather_detail, settings.gather_stride, settings.gather_object_stride
-    first, again, alone, at_edges = _points(real.need, stride, width, height, detail)
-    again += 1e6 * (alone * survey.real * pixels + at_edges * (edges - on_edges))
+    first, again, objects = gathered_points(settings, survey, width, height)
     counts = gathered(survey, real, first, settings.gather_rays)
     _add(counts, gathered(survey, real, again, settings.gather_rays, entered=real.entered_again))
-    first, again, alone, at_edges = _points(on_object.need, object_stride, width, height, detail)
-    again += 1e6 * (alone * survey.object * pixels + at_edges * on_edges)
-    _add(counts, gathered(survey, on_object, first + again, settings.gather_object_rays))
+    _add(counts, gathered(survey, on_object, objects, settings.gather_object_rays))
+    pixels = width * height * 1e-6
     if not survey.plate:
         # Real surfaces behind the objects are gathered point by point, with a quarter of the rays.
-        hidden = 1e6 * (survey.object * pixels + on_edges)
+        hidden = 1e6 * (survey.object * pixels + survey.edge.object * edges)
         _add(counts, gathered(survey, real, hidden, max(1, settings.gather_rays // 4), entered=real.entered_again))
-    blocks = pixels / stride**2 + pixels / object_stride**2
+    blocks = pixels / settings.gather_stride**2 + pixels / settings.gather_object_stride**2
     return {"frame": 1, "points": pixels + edges, "blocks": blocks, **counts}
+
+
+def gathered_points(settings: Settings, survey: Survey, width: int, height: int) -> tuple[float, float, float]:
+    """How many points are gathered: on real surfaces one of each block, on them at halved strides or by themselves,
+    and on objects."""
+    pixels, edges = float(width * height), settings.antialias * survey.outline * width
+    detail, on_edges = settings.gather_detail, survey.edge.object * edges
+    first, again, alone, at_edges = _points(survey.on_real.need, settings.gather_stride, width, height, detail)
+    again += alone * survey.real * pixels + at_edges * (edges - on_edges)
+    objects, more, alone, at_edges = _points(
+        survey.on_object.need, settings.gather_object_stride, width, height, detail
+    )
+    return first, again, objects + more + alone * survey.object * pixels + at_edges * on_edges
 
 
 def gathered(survey: Survey, where: PointNeed, points: float, rays: int, *, entered: float | None = None) -> Counts:

@@ -48,8 +48,9 @@ def choose_settings(
     check_request(seconds, max_error)
     if method == "path-trace":
         return _path_trace(scene, launcher, width, height, seconds, max_error, fixed)
+    start, compiled = time.perf_counter(), launcher.compile_seconds
     found = survey(scene, make_settings("balanced", fixed), launcher, width / height, has_plate=has_plate)
-    return choose(
+    choice = choose(
         found,
         load_model("cpu" if launcher.device.is_cpu else launcher.device.alias),
         width=width,
@@ -60,6 +61,9 @@ def choose_settings(
         fixed=fixed,
         method=method,
     )
+    if choice.pace is not None:
+        choice.pace.spent = time.perf_counter() - start - (launcher.compile_seconds - compiled)
+    return choice
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from warp_dvct.surfels import with_surfels
 
 if TYPE_CHECKING:
     from warp_dvct.budget import Choice
+    from warp_dvct.pace import Pace
 
 METHODS = ("delta-cones", "instant-radiosity", "path-trace")
 DEFAULT_WIDTH = 960
@@ -95,6 +96,7 @@ class Relighter:
         self._uploaded: tuple[str, DeviceScene, Lit | None] | None = None
         self._kept = Kept()
         self._had_plate = False
+        self._pace: Pace | None = None
         self._method_notices: tuple[Notice, ...] = ()
         self.stats: dict[str, Any] = {}
         self.load_seconds = 0.0
@@ -141,6 +143,9 @@ class Relighter:
     ) -> Choice:
         """Choose the settings for a time, or for an error, from now on; those given by name stay as they are.
 
+        Under a time the next frame settles how many rays are gathered, by the time that is left then; later frames
+        keep that number.
+
         Args:
             seconds: For one frame from scratch on this machine, without loading and compiling.
             max_error: Mean LDR-FLIP of the picture against a truth of many bounces.
@@ -163,7 +168,7 @@ class Relighter:
             has_plate=has_plate,
             fixed=self._given,
         )
-        self.settings = choice.settings
+        self.settings, self._pace = choice.settings, choice.pace
         self._plan(has_plate=has_plate)
         return choice
 
@@ -188,6 +193,8 @@ class Relighter:
         launcher.reset_times()
         compiled, compiled_cpu = launcher.compile_seconds, launcher.compile_cpu_seconds
         start, start_cpu = clock.perf_counter(), clock.process_time()
+        if self._pace is not None:
+            self._pace.begin(launcher)
         self._had_plate = plate is not None
         if self._planned_plate != self._had_plate:
             self._plan(has_plate=self._had_plate)
@@ -287,6 +294,11 @@ class Relighter:
             delta_cone_tracing.LightField,
             lambda uploaded: delta_cone_tracing.light_volumes(launcher, scene, uploaded, plan, self._kept),
         )
+        if self._pace is not None:
+            with launcher.scope("settle"):
+                self.settings = self._pace.settle(launcher, scene, device_scene, light_field, self.settings)
+                self._plan(has_plate=not with_before)
+            self._pace, plan = None, self.plan
         report("shading", 0.5)
         radiance = delta_cone_tracing.render(
             launcher, scene, device_scene, light_field, plan, with_before=with_before, kept=self._kept
@@ -333,7 +345,8 @@ def _content_keys(scene: Scene, plan: Plan) -> tuple[str, str]:
     clouds = [tuple(c for c in scene.point_clouds if c.role == role) for role in Role]
     real = content_key(meshes[Role.REAL], clouds[Role.REAL], *surfaces, plan.origin, plan.scale)
     passes = tuple(p.needed for p in plan.passes if p.name in ("voxelize", "pyramid", "bounces"))
-    rest = (plan.settings, plan.fine, plan.coarse, plan.start, plan.maps, passes)
+    settings = replace(plan.settings, gather_rays=0, gather_object_rays=0)  # the camera's passes alone read these
+    rest = (settings, plan.fine, plan.coarse, plan.start, plan.maps, passes)
     return real, content_key(real, meshes[Role.SYNTHETIC], clouds[Role.SYNTHETIC], scene.lights, *rest)
 
 

@@ -1,0 +1,167 @@
+"""Keeping a budget while it is spent: how many rays a point gathers is settled when the light is in the volumes.
+
+By then the frame has shown how fast the machine is just now, and a few points gathered on trial show what rays take in
+this scene. What is left of the time decides. All other settings follow from the scene and the budget alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from warp_dvct.cost import REST, Counts, gathered, gathered_points, price
+from warp_dvct.device_scene import DeviceScene
+from warp_dvct.launch import Launcher
+from warp_dvct.passes.gather import Gatherer, glossy_hits
+from warp_dvct.passes.gbuffer import render_gbuffer
+from warp_dvct.scene import Role, Scene
+from warp_dvct.settings import NAMES, Settings
+from warp_dvct.survey import Survey
+
+if TYPE_CHECKING:
+    from warp_dvct.methods.delta_cone_tracing import LightField
+
+WIDTH = 80  # of the picture whose points are gathered on trial
+TRIALS = 5  # of which the median counts: another process may hold a thread up in one of them
+LEAST_TRIAL = 2e-3  # seconds of each: the clock and the threads' start do not show in it
+TRIAL_SHARE = 0.01  # of what is left, for all trials
+LEAST_POINTS = 32  # of a trial: every thread has several
+MOST_TRIED = 512  # rays a point of a trial: more take in proportion
+SLOWNESS = (0.4, 4.0)  # measured over predicted seconds that are believed
+RAYS_SET = ("gather.rays", "gather.object_rays")  # what is settled
+LATER = ("direct", "specular", "resolve", "composite", "gbuffer", REST)  # passes that do not run before
+
+
+@dataclass(frozen=True)
+class Settled:
+    """What was settled.
+
+    Attributes:
+        rays: Of a point. planned: Of a point, when the settings were chosen.
+        slowness: Measured over predicted seconds of the passes until then. ray_slowness: Of gathered rays.
+    """
+
+    rays: int
+    planned: int
+    slowness: float
+    ray_slowness: float
+
+
+@dataclass
+class Pace:
+    """One frame's way through its budget.
+
+    Attributes:
+        width, height: Of the picture. aim: Seconds that the planning and the frame are to take together.
+        units: Seconds of the clock by pass and unit, see ``CostModel.clock_units``.
+        count: From settings to counts by pass of a frame.
+        least, most: Rays of a point.
+        spent: Seconds of the planning.
+        settled: Once the first frame was rendered.
+    """
+
+    survey: Survey
+    width: int
+    height: int
+    aim: float
+    units: dict[str, Counts]
+    count: Callable[[Settings], dict[str, Counts]]
+    least: int
+    most: int
+    spent: float = 0.0
+    settled: Settled | None = None
+    _began: tuple[float, float] = field(default=(0.0, 0.0), repr=False)
+
+    def begin(self, launcher: Launcher) -> None:
+        """The frame starts now."""
+        self._began = time.perf_counter(), launcher.compile_seconds
+
+    def settle(
+        self, launcher: Launcher, scene: Scene, device_scene: DeviceScene, lit: LightField, settings: Settings
+    ) -> Settings:
+        """Settings with as many rays as fit what is left, called when all but the camera's passes are done."""
+        wp.synchronize_device(launcher.device)
+        work = self.count(settings)
+        slowness = _ratio(
+            sum(launcher.pass_seconds.get(name, 0.0) for name in work if name not in LATER),
+            price({name: counts for name, counts in work.items() if name not in (*LATER, "gather")}, self.units),
+        )
+        later = slowness * price({name: work[name] for name in LATER if name in work}, self.units)
+        rays_slowness = self._try_rays(launcher, scene, device_scene, lit, settings, self._left(launcher) - later)
+        left = self._left(launcher) - later
+        low, high = self.least, self.most
+        while low < high:
+            middle = (low + high + 1) // 2
+            if rays_slowness * self._gather_seconds(with_rays(settings, middle)) <= left:
+                low = middle
+            else:
+                high = middle - 1
+        self.settled = Settled(low, settings.gather_rays, slowness, rays_slowness)
+        return with_rays(settings, low)
+
+    def _left(self, launcher: Launcher) -> float:
+        """Seconds of what is aimed at that are not spent yet; loading and compiling do not count."""
+        began, compiled = self._began
+        return self.aim - self.spent - (time.perf_counter() - began - (launcher.compile_seconds - compiled))
+
+    def _gather_seconds(self, settings: Settings) -> float:
+        return price({"gather": self.count(settings)["gather"]}, self.units)
+
+    def _try_rays(
+        self,
+        launcher: Launcher,
+        scene: Scene,
+        device_scene: DeviceScene,
+        lit: LightField,
+        settings: Settings,
+        left: float,
+    ) -> float:
+        """Measured over predicted seconds of rays, from points spread over a small picture in the proportion of real
+        surfaces and objects in which the gather will find them."""
+        rays, height = min(settings.gather_rays, MOST_TRIED), max(1, round(WIDTH * self.height / self.width))
+        buffer = render_gbuffer(launcher, device_scene, WIDTH, height, edge_samples=0, behind=False)
+        role = buffer.points.role.numpy()[: WIDTH * height]
+        found = [np.flatnonzero(role == int(r)) for r in (Role.REAL, Role.SYNTHETIC)]
+        first, again, objects = gathered_points(settings, self.survey, self.width, self.height)
+        share = objects / max(first + again + objects, 1.0)
+        one = self._trial_seconds(1.0 - share, share, rays)
+        wanted = max(LEAST_TRIAL, TRIAL_SHARE * left / TRIALS) / max(one, 1e-9)
+        points = int(np.clip(wanted, LEAST_POINTS, len(role)))
+        hits = glossy_hits(launcher, scene, device_scene, lit.bounces, settings.seed)
+        gatherer = Gatherer(device_scene, lit.world, rays, settings.seed, hits=hits)
+        numbers = round((1.0 - share) * points), round(share * points)
+        ratios = []
+        for k in range(TRIALS):
+            chosen = [_spread(pixels, n, k) for pixels, n in zip(found, numbers, strict=True)]
+            index = launcher.array(np.concatenate(chosen).astype(np.int32), wp.int32)
+            predicted = self._trial_seconds(len(chosen[0]), len(chosen[1]), rays)
+            start, compiled = time.perf_counter(), launcher.compile_seconds
+            gatherer.run(launcher, buffer.points, index, index.shape[0], stride=settings.gather_stride)
+            wp.synchronize_device(launcher.device)
+            ratios.append(_ratio(time.perf_counter() - start - (launcher.compile_seconds - compiled), predicted))
+        return float(np.median(ratios))
+
+    def _trial_seconds(self, real: float, objects: float, rays: int) -> float:
+        """Predicted, of rays from some points on real surfaces and on objects."""
+        wheres = (self.survey.on_real, real), (self.survey.on_object, objects)
+        return sum(price({"gather": gathered(self.survey, w, n, rays)}, self.units) for w, n in wheres)
+
+
+def _spread(pixels: np.ndarray, count: int, trial: int) -> np.ndarray:
+    """``count`` of some pixels, evenly over all of them, others in each trial."""
+    count = min(count, len(pixels))
+    return pixels[((np.arange(count) + (trial + 0.5) / TRIALS) * len(pixels) / max(count, 1)).astype(int)]
+
+
+def with_rays(settings: Settings, rays: int) -> Settings:
+    """``settings`` with as many gathered rays of every point."""
+    return replace(settings, **{NAMES[name]: rays for name in RAYS_SET})
+
+
+def _ratio(measured: float, predicted: float) -> float:
+    return float(np.clip(measured / max(predicted, 1e-6), *SLOWNESS))
