@@ -275,8 +275,8 @@ def test_a_stage_without_light_is_refused_but_a_dark_one_is_not(build):
     build.stage.RemovePrim("/World/Light")
     with pytest.raises(StageError, match="has no light; add a UsdLux light"):
         build.read()
-    build.stage.DefinePrim(PATH, "CylinderLight")
-    with pytest.raises(StageError, match="no light of a supported type; /World/Lamp: a CylinderLight is not supported"):
+    build.stage.DefinePrim(PATH, "GeometryLight")
+    with pytest.raises(StageError, match="no light of a supported type; /World/Lamp: a GeometryLight is not supported"):
         build.read()
 
 
@@ -285,7 +285,7 @@ def test_what_is_not_modelled_is_listed(build):
     prim.GetAttribute("inputs:shadow:enable").Set(False)
     UsdLux.LightAPI(prim).GetLightLinkCollectionAPI().ExcludePath("/World/Room")
     UsdLux.LightAPI(prim).GetShadowLinkCollectionAPI().ExcludePath("/World/Room")
-    build.stage.DefinePrim("/World/Tube", "CylinderLight")
+    build.stage.DefinePrim("/World/Tube", "GeometryLight")
     lit = UsdGeom.Cube.Define(build.stage, "/World/Glow")
     lit.GetPrim().ApplyAPI("MeshLightAPI")
     text = [str(n) for n in build.read().notices]
@@ -294,11 +294,43 @@ def test_what_is_not_modelled_is_listed(build):
         "/World/Lamp: shadow linking is not modelled",
         "/World/Lamp: inputs:diffuse",
         "/World/Lamp: inputs:shadow:enable",
-        "/World/Tube: a CylinderLight is not supported",
+        "/World/Tube: a GeometryLight is not supported",
         "/World/Glow: a mesh light",
     ):
         assert any(line.startswith(expected) for line in text), expected
     assert "/World/Glow" in [m.path for m in build.read().meshes]
+
+
+@pytest.mark.parametrize("mirror", [1, -1])
+def test_a_tube_is_a_prism_of_its_area_that_faces_outwards(build, mirror):
+    """Along local x, round it, without caps: as bright from every side as the tube, to 6 %, and in the mean exactly."""
+    prim = lamp(build, "CylinderLight", intensity=3.0, radius=0.2, length=4.0)
+    UsdGeom.Xformable(prim).AddTranslateOp().Set(Gf.Vec3d(1, 2, 3))
+    UsdGeom.Xformable(prim).AddScaleOp().Set(Gf.Vec3f(mirror, 1, 1))
+    tube = [x for x in build.read().lights if x.path.startswith(PATH)]
+    assert {x.kind for x in tube} == {LightKind.RECT}
+    assert {x.radiance for x in tube} == {(3.0, 3.0, 3.0)}
+    areas = np.array([4 * np.linalg.norm(np.cross(x.axis_x, x.axis_y)) for x in tube])
+    assert areas.sum() == pytest.approx(2 * np.pi * 0.2 * 4.0)
+    normals, places = (np.array([getattr(x, name) for x in tube]) for name in ("direction", "position"))
+    assert places.mean(0) == pytest.approx([1, 2, 3])
+    assert np.einsum("fk,fk->f", normals, places - [1, 2, 3]) == pytest.approx(np.full(len(tube), 0.2), rel=0.06)
+    angles = np.linspace(0, 2 * np.pi, 721)
+    towards = np.stack([0 * angles, np.cos(angles), np.sin(angles)], -1)
+    seen = (np.maximum(normals @ towards.T, 0) * areas[:, None]).sum(0)
+    assert seen == pytest.approx(np.full(len(angles), 2 * 0.2 * 4.0), rel=0.06)
+    assert seen[:-1].mean() == pytest.approx(2 * 0.2 * 4.0, rel=1e-4)
+
+
+def test_what_a_tube_cannot_do_is_listed(build):
+    prim = lamp(build, "CylinderLight", "ShapingAPI", treatAsLine=True, normalize=True, intensity=10.0, radius=0.5)
+    assert build.read().lights[-1].radiance[0] == pytest.approx(10.0 / np.pi)
+    text = " ".join(str(n) for n in build.read().notices)
+    for expected in ("prism of 8 RectLights", "treatAsLine", "shaping of a CylinderLight"):
+        assert expected in text
+    prim.GetAttribute("inputs:radius").Set(0.0)
+    with pytest.raises(StageError, match="/World/Lamp: inputs:radius is 0"):
+        build.read()
 
 
 def test_time_samples(build):

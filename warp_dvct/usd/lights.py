@@ -17,6 +17,7 @@ from warp_dvct.usd.textures import ImageCache, as_rgb, asset_file
 if TYPE_CHECKING:
     from pxr import Usd
 
+TUBE_FACES = 8  # of the prism that stands for a CylinderLight
 EVEN = 1e-3  # relative difference of scales from which a sphere counts as stretched
 
 
@@ -61,7 +62,8 @@ def read_lights(placed: Placed, ctx: Context, images: ImageCache) -> list[Light]
         path = placed.path if len(placed.matrices) == 1 else f"{placed.path}[{number}]"
         emitter = _Emitter(placed.prim, path, m, ctx, images)
         _note_unsupported(emitter)
-        lights.append(reader(emitter, _emission(emitter), {"role": placed.light_role, "path": path}))
+        made = reader(emitter, _emission(emitter), {"role": placed.light_role, "path": path})
+        lights += made if isinstance(made, list) else [made]
     return lights
 
 
@@ -166,6 +168,43 @@ def _disk(e: _Emitter, value: np.ndarray, common: dict[str, Any]) -> Light:
     return Light(LightKind.DISK, _rgb(_per_area(e, value, area)), **frame, **common)
 
 
+def _cylinder(e: _Emitter, value: np.ndarray, common: dict[str, Any]) -> list[Light]:
+    """A tube along local x without caps, as the faces of a prism with the tube's area.
+
+    Seen from afar across its axis, a convex body is as wide in the mean as its outline is long over pi (Cauchy): so the
+    prism sends the tube's power, and between 5 % less and 3 % more of it into single directions.
+    """
+    if e.get("treatAsLine", False):
+        e.note("treatAsLine is not modelled: its radius counts")
+    if _shaping(e):
+        e.note("shaping of a CylinderLight is not modelled: it shines all round")
+    e.note(f"a CylinderLight is drawn as a prism of {TUBE_FACES} RectLights")
+    length, radius = e.size("inputs:length"), e.size("inputs:radius")
+    half = np.pi / TUBE_FACES
+    rim = radius * half / np.sin(half)  # of the prism, so that its outline is as long as the circle
+    faces = []
+    for turn in 2.0 * half * np.arange(TUBE_FACES):
+        outwards = np.array([0.0, np.cos(turn), np.sin(turn)])
+        along = rim * np.sin(half) * np.array([0.0, -np.sin(turn), np.cos(turn)])
+        x, y = 0.5 * length * e.m[0, :3], along @ e.m[:3, :3]
+        middle = rim * np.cos(half) * outwards @ e.m[:3, :3]
+        normal = _unit(np.cross(x, y), e)
+        faces.append((x, y, e.m[3, :3] + middle, normal if np.dot(normal, middle) > 0.0 else -normal))
+    value = _per_area(e, value, 4.0 * sum(float(np.linalg.norm(np.cross(x, y))) for x, y, _, _ in faces))
+    return [
+        Light(
+            LightKind.RECT,
+            _rgb(value),
+            axis_x=_rgb(x),
+            axis_y=_rgb(y),
+            position=_rgb(position),
+            direction=_rgb(normal),
+            **common | {"path": f"{common['path']}.face{number}"},
+        )
+        for number, (x, y, position, normal) in enumerate(faces)
+    ]
+
+
 def _distant(e: _Emitter, value: np.ndarray, common: dict[str, Any]) -> Light:
     """``normalize`` divides by pi sin^2(angle / 2): ``intensity`` is then the irradiance of a plane facing it."""
     degrees = float(e.get("inputs:angle"))
@@ -199,6 +238,7 @@ READERS = {
     "SphereLight": _sphere,
     "RectLight": _rect,
     "DiskLight": _disk,
+    "CylinderLight": _cylinder,
     "DistantLight": _distant,
     "DomeLight": _dome,
     "DomeLight_1": _dome,
