@@ -267,8 +267,8 @@ def test_what_is_not_modelled_is_listed_once_and_means_stand_in(build, tmp_path)
     assert material_of(scene)[1].metallic == pytest.approx(0.2)
     assert sorted(n.message for n in scene.notices) == [
         "a texture on metallic is not supported; its mean is used",
-        "emissiveColor is not modelled",
-        "opacity is not modelled",
+        "emissiveColor is not modelled: it gives no light",
+        "opacity is not modelled: drawn opaque",
     ]
 
 
@@ -291,6 +291,24 @@ def test_shaders_of_other_kinds_fall_back_to_the_display_colour(build):
     scene = build.read()
     assert material_of(scene)[1].base_color == pytest.approx((0.2, 0.4, 0.6))
     assert "'ND_standard_surface_surfaceshader' is not UsdPreviewSurface" in scene.notices[0].message
+
+
+def test_a_binding_to_nothing_is_listed_where_it_is_authored(build):
+    """As after a rename: without a word the object would be grey."""
+    build.quad("/World/Group/Mesh").CreateDisplayColorAttr([(0.2, 0.4, 0.6)])
+    api = UsdShade.MaterialBindingAPI.Apply(build.stage.GetPrimAtPath("/World/Group"))
+    api.GetDirectBindingRel().SetTargets(["/World/Looks/Gone"])
+    scene = build.read()
+    assert str(scene.notices[0]).startswith("/World/Group: is bound to /World/Looks/Gone, which is no material")
+    assert material_of(scene, "/World/Group/Mesh")[1].base_color == pytest.approx((0.2, 0.4, 0.6))
+
+
+@pytest.mark.parametrize(
+    ("values", "listed"), [([0.3], True), ([1.0, 1.0, 0.5, 1.0], True), ([1.0], False), ([], False)]
+)
+def test_display_opacity_is_listed_where_it_shows(build, values, listed):
+    build.quad().CreateDisplayOpacityAttr(values)
+    assert [n.message for n in build.read().notices] == ["displayOpacity is not modelled: drawn opaque"] * listed
 
 
 def test_display_colour_of_unbound_geometry_is_a_matte_surface(build):

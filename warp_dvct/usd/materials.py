@@ -26,6 +26,7 @@ NOT_MODELLED: dict[str, Any] = {
     "displacement": 0.0,
     "occlusion": 1.0,
 }
+INSTEAD = {"opacity": ": drawn opaque", "emissiveColor": ": it gives no light"}
 
 
 @dataclass(frozen=True)
@@ -78,8 +79,17 @@ class Materials:
 
         if not prims:
             return []
-        found, _ = UsdShade.MaterialBindingAPI.ComputeBoundMaterials(list(prims), UsdShade.Tokens.full)
-        return [self._look(material) if material else PLAIN for material in found]
+        found, bindings = UsdShade.MaterialBindingAPI.ComputeBoundMaterials(list(prims), UsdShade.Tokens.full)
+        return [self._look(m) if m else self._unbound(binding) for m, binding in zip(found, bindings, strict=True)]
+
+    def _unbound(self, binding: Usd.Relationship) -> Look:
+        """The look without a material, which is listed where a binding names one that is not there."""
+        if binding:
+            names = ", ".join(str(path) for path in binding.GetTargets())
+            self._ctx.notices.add(
+                binding.GetPrim().GetPath(), f"is bound to {names}, which is no material; drawn with its display colour"
+            )
+        return PLAIN
 
     def _look(self, material: UsdShade.Material) -> Look:
         key = shared_path(material.GetPrim())
@@ -182,11 +192,11 @@ class Materials:
 
     def _note_unless(self, shader: UsdShade.Shader, name: str, neutral: Any, path: str) -> None:
         if read_connection(shader, name, self._ctx) is not None:
-            self._ctx.notices.add(path, f"{name} is not modelled")
+            self._ctx.notices.add(path, f"{name} is not modelled{INSTEAD.get(name, '')}")
             return
         value = _input_value(shader, name, self._ctx)
         if value is not None and not np.allclose(np.array(value, dtype=float), neutral):
-            self._ctx.notices.add(path, f"{name} is not modelled")
+            self._ctx.notices.add(path, f"{name} is not modelled{INSTEAD.get(name, '')}")
 
     def _rgb(self, value: Any, path: str, name: str) -> tuple[float, float, float]:
         rgb = np.array(value, dtype=np.float64)[:3]

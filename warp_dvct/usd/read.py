@@ -246,6 +246,7 @@ class _GeometryBuilder:
         """A look whose colour comes from a primvar: as a constant where it is one, else with corner colours."""
         if look.color is None:
             return look, None
+        self._note_opacity(placed)
         corners = self._primvar(placed, local, look.color, 3)
         if corners is None:
             constant = look.color_fallback
@@ -257,6 +258,14 @@ class _GeometryBuilder:
                 return look, corners
             constant = (float(corners[0, 0, 0]), float(corners[0, 0, 1]), float(corners[0, 0, 2]))
         return replace(look, material=replace(look.material, base_color=constant)), None
+
+    def _note_opacity(self, placed: Placed) -> None:
+        from pxr import UsdGeom
+
+        opacity = UsdGeom.PrimvarsAPI(placed.prim).FindPrimvarWithInheritance("displayOpacity")
+        values = opacity.Get(self._ctx.time) if opacity else None
+        if values is not None and np.min(values, initial=1.0) < 1.0:
+            self._ctx.notices.add(placed.path, "displayOpacity is not modelled: drawn opaque")
 
     def _coordinates(self, placed: Placed, local: LocalMesh, look: Look) -> np.ndarray:
         """Texture coordinates ``[t, 3, 2]`` of a look; its fallback where the prim has none."""
