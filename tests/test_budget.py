@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from known_costs import made_model
 
 from warp_dvct import Relighter
 from warp_dvct.accuracy import LADDERS, STRIDE, load_accuracy
@@ -15,7 +16,6 @@ from warp_dvct.budget import Choice, choose
 from warp_dvct.calibrate import calibrate, subdivide
 from warp_dvct.cost import (
     FIRST_RAYS,
-    CostModel,
     Sample,
     count_work,
     fit,
@@ -185,24 +185,6 @@ def test_non_negative_least_squares():
         assert (found >= 0).all()
         assert (slope <= 1e-9).all()  # Karush, Kuhn and Tucker
         np.testing.assert_allclose(slope[found > 0], 0, atol=1e-9)
-
-
-def made_model(threads: int = 2) -> CostModel:
-    """Unit costs of one's own, in about the proportions of a real machine."""
-    units = {
-        "survey": {"frame": 0.05},
-        "voxelize": {"frame": 0.02, "records": 0.4},
-        "rsm": {"texels": 0.17},
-        "bounces": {"frame": 0.01, "met": 0.3, "records": 0.2},
-        "direct": {"frame": 0.005, "probes": 0.05, "near deep": 0.005},
-        "gather": {"frame": 0.005, "rays": 0.3, "synthetic deep": 0.03, "points": 0.2},
-        "specular": {"sharp": 1.0},
-        "gbuffer": {"pixels": 0.3},
-        "ism": {"maps": 1e-6, "splats": 0.1, "texels": 0.09},
-        "vpl shading": {"points": 0.5, "pairs": 0.1},
-        "vpl bounces": {"points": 1.0},
-    }
-    return CostModel("cpu", threads, "made", units, {"gather": 2.0, "rsm": 1.5}, 0.1)
 
 
 def test_a_fit_finds_the_units_that_made_the_samples(surveys):
@@ -381,18 +363,45 @@ def test_a_relighter_keeps_a_budget(monkeypatch, tmp_path):
     assert few.to_dict()["chosen"]["vpls.further"] == few.settings.vpls_further
 
 
-def test_paths_are_tried_for_their_time_and_noise():
-    """More time, more samples and less noise; an error asks for the samples that reach it."""
+def test_paths_buy_what_their_time_says(monkeypatch):
+    """Paths of a known time and noise: the samples that a budget holds, the fewest that keep an error, the floor."""
+    from warp_dvct import planning
+
+    known = planning._Paths(2e-6, 4e-6, spent=0.1, spent_cpu=0.2, noise=0.02, falls=0.5)
+    monkeypatch.setattr(planning, "_try_paths", lambda *args: known)
     tracer = Relighter(path("colour_bleeding"), method="path-trace", width=48)
-    few, many = tracer.keep_budget(2.0), tracer.keep_budget(40.0)
-    assert 1 <= few.settings.samples < many.settings.samples
-    assert few.error > many.error > 0.0
-    # Little less, as how many samples the budget buys is the clock's: half of a small error may be out of reach.
-    assert tracer.keep_budget(max_error=0.9 * few.error).settings.samples > few.settings.samples
+    each = 2e-6 * tracer.width * tracer.height
+    few, many = tracer.keep_budget(1.0), tracer.keep_budget(20.0)
+    for budget, choice in ((1.0, few), (20.0, many)):
+        samples = choice.settings.samples
+        assert choice.seconds == pytest.approx(0.1 + samples * each)
+        assert 0.1 + samples * each <= 0.95 * budget < 0.1 + (samples + 1) * each
+        assert choice.error == pytest.approx(
+            planning.FLIP_OF_NOISE * 0.02 * math.sqrt(planning.PILOT_SAMPLES / samples)
+        )
+    for error in (0.5 * few.error, 0.03 * few.error):
+        samples = tracer.keep_budget(max_error=error).settings.samples
+        assert known.error(samples) <= error < known.error(samples - 1)
     with pytest.raises(OptionError, match=r"would take \d+ samples a pixel"):
         tracer.keep_budget(max_error=1e-9)
-    with pytest.raises(OptionError, match="below the floor"):
-        tracer.keep_budget(1e-5)
+    with pytest.raises(OptionError, match=rf"below the floor: .* about {0.1 + each:.2f} s"):
+        tracer.keep_budget(0.1)
+
+
+def test_paths_are_tried_on_the_scene():
+    """The noise is the scene's and the same each time; only what a path takes is the clock's."""
+    from warp_dvct.planning import FALLS, _try_paths
+
+    tries = []
+    for stage in ("colour_bleeding", "colour_bleeding", "room_area"):
+        scene = read_stage(path(stage))
+        tries.append(_try_paths(scene, Launcher("cpu", 2), 48, 27, make_settings("balanced")))
+        assert tries[-1].seconds > 0 < tries[-1].cpu_seconds
+        assert tries[-1].spent > 8 * 48 * 27 * tries[-1].seconds  # two pictures of four samples, and the upload
+        assert FALLS[0] <= tries[-1].falls <= FALLS[1]
+    assert tries[0].noise == tries[1].noise > 0
+    assert tries[0].falls == tries[1].falls
+    assert tries[2].noise != tries[0].noise
 
 
 def test_the_noise_of_paths_is_about_that_measured():

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from warp_dvct.accuracy import DETAIL, FILLED, LADDERS_OF, RAYS, Accuracy, Ladder, load_accuracy, matters
-from warp_dvct.cost import CostModel, Counts, count_survey, count_work, price
+from warp_dvct.cost import CHOOSING, CostModel, Counts, count_survey, count_work, price
 from warp_dvct.cost_vpls import count_vpl_work
 from warp_dvct.errors import OptionError
 from warp_dvct.pace import RAYS_SET, Pace
@@ -142,7 +142,7 @@ class _Chooser:
             for x in LADDERS_OF[method]
             if matters(x.knob, survey) and not any(k in fixed for k in x.settings(x.values[0]))
         ]
-        self.planning = {"survey": count_survey(survey)}
+        self.planning = {"survey": count_survey(survey), CHOOSING: {"frame": 1.0}}
         self.prices = model.clock_units(threads)
         self.reference = accuracy.reference(survey, width, method) if survey.changes else 0.0
         self.excesses: dict[tuple[str, float, float], float] = {}

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from warp_dvct import usd_scenes
-from warp_dvct.accuracy import LADDERS_OF
-from warp_dvct.cost import REST, CostModel, Sample, count_survey, count_work, fit, processor, shipped_model
+from warp_dvct.accuracy import LADDERS_OF, RAYS
+from warp_dvct.budget import choose
+from warp_dvct.cost import CHOOSING, REST, CostModel, Sample, count_survey, count_work, fit, processor, shipped_model
 from warp_dvct.cost_vpls import RENAMED, count_vpl_work
 from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher
@@ -26,8 +27,12 @@ WIDTHS = (128, 256, 384, 512)
 COUNT = {"delta-cones": count_work, "instant-radiosity": count_vpl_work}
 FRAMES_EACH = {"delta-cones": 1, "instant-radiosity": 4}  # one of so many frames is of the method
 REPEATS = 2  # of which the least counts: other work on the machine only adds
+LONG = 2.0  # processor seconds of a frame from which one try is enough: short disturbances even out
 SPLITS = 2  # of the last stage's triangles, once more: what deep trees and many triangles cost
-MOST_SECONDS = 3.0  # of processor time a frame, by the shipped model: dearer draws are drawn again
+MOST_SECONDS = 6.0  # of processor time a frame, by the shipped model: dearer draws are drawn again
+MORE_RAYS = (1024, 2048)  # beyond their ladder: what is left of a long budget goes into them
+BUDGETS = (4.0, 20.0)  # seconds, between which a search for settings is timed
+SEARCHED = {"width": 320, "height": 180}
 MOST_DRAWS = 50
 
 
@@ -57,7 +62,7 @@ def calibrate(
         for k in range(frames):
             report(name, (i * frames + k) / (len(scenes) * frames))
             plate = k % 4 != 3
-            looked, found = _look(name, scene, launcher, plate=plate)
+            looked, found = _look(name, scene, launcher, rng, plate=plate)
             samples.append(looked)
             methods = [method for method, each in FRAMES_EACH.items() if k % each == 0]
             samples += [_measure(name, scene, found, launcher, rng, method) for method in methods]
@@ -65,19 +70,40 @@ def calibrate(
     return fit(samples, device=device, threads=launcher.threads, machine=processor()), samples
 
 
-def _look(name: str, scene: Scene, launcher: Launcher, *, plate: bool) -> tuple[Sample, Survey]:
-    """The survey, timed: the lesser of a few."""
+def _look(
+    name: str, scene: Scene, launcher: Launcher, rng: np.random.Generator, *, plate: bool
+) -> tuple[Sample, Survey]:
+    """The survey, and a search for settings, timed: the lesser of a few."""
+    seconds = float(np.exp(rng.uniform(*np.log(BUDGETS))))
     found, times = None, []
     for _ in range(REPEATS):
-        start, cpu_start = time.perf_counter(), time.process_time()
-        compiled, compiled_cpu = launcher.compile_seconds, launcher.compile_cpu_seconds
+        start = _Clock(launcher)
         found = survey(scene, make_settings(), launcher, scene.camera.aspect, has_plate=plate)
-        wall = time.perf_counter() - start - (launcher.compile_seconds - compiled)
-        cpu = time.process_time() - cpu_start - (launcher.compile_cpu_seconds - compiled_cpu)
-        times.append((wall if launcher.device.is_cuda else cpu, wall))
+        surveyed = start.spent()
+        start = _Clock(launcher)
+        choose(found, shipped_model(), threads=launcher.threads, seconds=seconds, **SEARCHED)
+        times.append((surveyed, start.spent()))
     assert found is not None
-    cpu, wall = min(times)
-    return Sample({"survey": count_survey(found)}, {"survey": cpu}, {"survey": wall}, f"{name} survey"), found
+    work = {"survey": count_survey(found), CHOOSING: {"frame": 1.0}}
+    surveyed, chosen = (min(t[k] for t in times) for k in (0, 1))
+    cpu, wall = ({"survey": surveyed[k], CHOOSING: chosen[k]} for k in (0, 1))
+    return Sample(work, wall if launcher.device.is_cuda else cpu, wall, f"{name} survey"), found
+
+
+class _Clock:
+    """Processor seconds and seconds since it was made, without loading and compiling."""
+
+    def __init__(self, launcher: Launcher) -> None:
+        self.launcher = launcher
+        self.start = self._now()
+
+    def _now(self) -> np.ndarray:
+        compiled = self.launcher.compile_cpu_seconds, self.launcher.compile_seconds
+        return np.array([time.process_time(), time.perf_counter()]) - compiled
+
+    def spent(self) -> tuple[float, float]:
+        cpu, wall = self._now() - self.start
+        return float(cpu), float(wall)
 
 
 def _measure(
@@ -93,6 +119,8 @@ def _measure(
         relighter = Relighter(scene, method=method, settings=settings, **size)
         relighter.render(plate)
         stats.append(_with_rest(relighter.stats, method, by_clock=launcher.device.is_cuda))
+        if relighter.stats["cpu_seconds"] > LONG:
+            break
     work = COUNT[method](make_settings("balanced", settings), found, width, height)
     cpu_passes, wall_passes = ({n: min(f[k][n] for f in stats) for n in stats[0][k]} for k in (0, 1))
     shown = " ".join(f"{k}={v}" for k, v in settings.items())
@@ -106,7 +134,8 @@ def _draw(scene: Scene, found: Survey, rng: np.random.Generator, method: str) ->
     width = WIDTHS[0]
     for _ in range(MOST_DRAWS):
         for ladder in LADDERS_OF[method]:
-            settings |= ladder.settings(ladder.values[rng.integers(len(ladder.values))])
+            values = ladder.values + (MORE_RAYS if ladder.knob == RAYS else ())
+            settings |= ladder.settings(values[rng.integers(len(values))])
         width = int(rng.choice(WIDTHS))
         work = COUNT[method](make_settings("balanced", settings), found, width, round(width / scene.camera.aspect))
         if shipped.cpu_seconds(work) <= MOST_SECONDS:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from warp_dvct.methods.delta_cone_tracing import LightField
 
 WIDTH = 80  # of the picture whose points are gathered on trial
-TRIALS = 5  # of which the median counts: another process may hold a thread up in one of them
+TRIALS = 3  # of which the median counts: another process may hold a thread up in one of them
 LEAST_TRIAL = 2e-3  # seconds of each: the clock and the threads' start do not show in it
 TRIAL_SHARE = 0.01  # of what is left, for all trials
 LEAST_POINTS = 32  # of a trial: every thread has several
@@ -87,10 +87,8 @@ class Pace:
         """Settings with as many rays as fit what is left, called when all but the camera's passes are done."""
         wp.synchronize_device(launcher.device)
         work = self.count(settings)
-        slowness = _ratio(
-            sum(launcher.pass_seconds.get(name, 0.0) for name in work if name not in LATER),
-            price({name: counts for name, counts in work.items() if name not in (*LATER, "gather")}, self.units),
-        )
+        done = {name: work[name] for name in launcher.pass_seconds if name in work and name not in (*LATER, "gather")}
+        slowness = _ratio(sum(launcher.pass_seconds[name] for name in done), price(done, self.units))
         later = slowness * price({name: work[name] for name in LATER if name in work}, self.units)
         rays_slowness = self._try_rays(launcher, scene, device_scene, lit, settings, self._left(launcher) - later)
         left = self._left(launcher) - later

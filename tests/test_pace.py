@@ -1,0 +1,128 @@
+"""How a budget is kept while it is spent: the rays of the gather, settled by the time that is left."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from known_costs import made_model
+
+from warp_dvct import Relighter
+from warp_dvct.budget import Choice, choose
+from warp_dvct.cost import price
+from warp_dvct.pace import LATER, Pace, with_rays
+from warp_dvct.settings import NAMES, Settings, make_settings
+from warp_dvct.survey import Survey, survey
+from warp_dvct.usd.read import read_stage
+from warp_dvct.usd_scenes import path
+
+
+@pytest.fixture(scope="module")
+def surveys(launcher) -> dict[str, Survey]:
+    """Of a closed diffuse room, one with mirrors, an open scene."""
+    scenes = {name: read_stage(path(name)) for name in ("room_area", "room_glossy", "ground_dome")}
+    return {name: survey(scene, make_settings(), launcher, 16 / 9, has_plate=True) for name, scene in scenes.items()}
+
+
+def chosen(surveys, stage: str = "room_area", **request) -> Choice:
+    """A choice on the made machine at 320 x 180."""
+    return choose(surveys[stage], made_model(), width=320, height=180, threads=2, **request)
+
+
+class Machine:
+    """Stands for a launcher under a clock of its own: a frame has taken ``slowness`` times what was predicted."""
+
+    compile_seconds = 0.0
+    device = None
+
+    def __init__(self, pace: Pace, settings: Settings, slowness: float) -> None:
+        work = pace.count(settings)
+        done = {name: counts for name, counts in work.items() if name not in (*LATER, "gather")}
+        self.pass_seconds = {name: slowness * price({name: counts}, pace.units) for name, counts in done.items()}
+
+
+@pytest.mark.parametrize(("stage", "budget"), [("room_area", 1.0), ("room_glossy", 4.0), ("ground_dome", 20.0)])
+@pytest.mark.parametrize("slowness", [0.7, 1.0, 1.4])
+def test_rays_take_what_is_left_of_the_time(surveys, monkeypatch, stage, budget, slowness):
+    """On a machine of a known speed, where rays cost by another factor than the rest: planning, what was done, what is
+    still to do and the settled rays add up to what is aimed at."""
+    from warp_dvct import pace as module
+
+    choice = chosen(surveys, stage, seconds=budget)
+    pace, settings = choice.pace, choice.settings
+    now = iter((100.0, 100.0 + 0.3 * budget, 100.0 + 0.3 * budget))
+    monkeypatch.setattr(module.time, "perf_counter", lambda: next(now))
+    monkeypatch.setattr(module.wp, "synchronize_device", lambda device: None)
+    monkeypatch.setattr(Pace, "_try_rays", lambda self, *args: 0.8 * slowness)
+    pace.spent = 0.05 * budget
+    machine = Machine(pace, settings, slowness)
+    pace.begin(machine)
+    made = pace.settle(machine, None, None, None, settings)
+    assert pace.settled.slowness == pytest.approx(slowness)
+    assert replace(made, gather_rays=settings.gather_rays, gather_object_rays=settings.gather_object_rays) == settings
+    assert made.gather_rays == made.gather_object_rays == pace.settled.rays
+
+    def total(settings: Settings) -> float:
+        work = pace.count(settings)
+        later = sum(price({n: work[n]}, pace.units) for n in LATER if n in work)
+        return 0.35 * budget + slowness * (later + 0.8 * price({"gather": work["gather"]}, pace.units))
+
+    assert total(made) <= 0.95 * budget < total(with_rays(made, made.gather_rays + 1))
+
+
+def test_settled_rays_have_bounds(surveys, monkeypatch):
+    """Late beyond help, the fewest rays; where more would not show, no more than planned."""
+    from warp_dvct import pace as module
+
+    monkeypatch.setattr(module.wp, "synchronize_device", lambda device: None)
+    monkeypatch.setattr(Pace, "_try_rays", lambda self, *args: 0.5)
+    for seconds, spent, bound in ((1.0, 1e3, "least"), (10_000.0, 0.0, "most")):
+        choice = chosen(surveys, seconds=seconds)
+        choice.pace.spent = spent
+        machine = Machine(choice.pace, choice.settings, 0.5)
+        choice.pace.begin(machine)
+        assert choice.pace.settle(machine, None, None, None, choice.settings).gather_rays == getattr(choice.pace, bound)
+    assert choice.enough
+    assert choice.pace.most == choice.settings.gather_rays
+
+
+@pytest.mark.parametrize("request_", [{"max_error": 0.05}, {"seconds": 2.0, "fixed": {"gather.rays": 64}}])
+def test_rays_that_are_not_the_clock_s_stay(surveys, request_):
+    assert chosen(surveys, **request_).pace is None
+    assert chosen(surveys, seconds=5.0, method="instant-radiosity").pace is None
+
+
+def test_a_settled_frame_is_that_of_its_settings(monkeypatch, tmp_path):
+    """The first frame settles the rays; it, and the next, equal a new frame of those settings bit for bit, and the
+    second is not voxelised again."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    relighter = Relighter(path("colour_bleeding"), width=48)
+    choice = relighter.keep_budget(1.0)
+    first, settled = relighter.render(), choice.pace.settled
+    assert relighter.settings == with_rays(choice.settings, settled.rays) == relighter.plan.settings
+    assert settled.planned == choice.settings.gather_rays
+    assert 0.4 <= settled.slowness <= 4.0
+    assert 0.4 <= settled.ray_slowness <= 4.0
+    assert choice.to_dict()["chosen"]["gather.rays"] == choice.to_dict()["settled"]["rays"] == settled.rays
+    assert "settle" in relighter.stats["passes"]
+    second = relighter.render()
+    assert not {"settle", "voxelize", "upload"} & set(relighter.stats["passes"])
+    names = {name: getattr(relighter.settings, attribute) for name, attribute in NAMES.items()}
+    alone = Relighter(path("colour_bleeding"), width=48, settings=names).render()
+    for layers in (first, second):
+        np.testing.assert_array_equal(layers.comp, alone.comp)
+        np.testing.assert_array_equal(layers.delta, alone.delta)
+
+
+def test_trials_are_spread_over_the_picture():
+    """Points of each trial lie evenly, and are not those of another."""
+    from warp_dvct.pace import TRIALS, _spread
+
+    pixels = np.arange(0, 5000, 2)
+    trials = [_spread(pixels, 50, k) for k in range(TRIALS)]
+    for points in trials:
+        np.testing.assert_allclose(np.diff(points), 100, atol=2)
+    assert len(np.unique(np.concatenate(trials))) == 50 * TRIALS
+    assert len(_spread(pixels[:3], 50, 0)) == 3
+    assert len(_spread(pixels[:0], 50, 0)) == 0
