@@ -32,7 +32,7 @@ SPLITS = 2  # of the last stage's triangles, once more: what deep trees and many
 MOST_SECONDS = 6.0  # of processor time a frame, by the shipped model: dearer draws are drawn again
 MORE_RAYS = (1024, 2048)  # beyond their ladder: what is left of a long budget goes into them
 BUDGETS = (4.0, 20.0)  # seconds, between which a search for settings is timed
-SEARCHED = {"width": 320, "height": 180}
+SEARCHED = 320, 180  # pixels
 MOST_DRAWS = 50
 
 
@@ -81,7 +81,8 @@ def _look(
         found = survey(scene, make_settings(), launcher, scene.camera.aspect, has_plate=plate)
         surveyed = start.spent()
         start = _Clock(launcher)
-        choose(found, shipped_model(), threads=launcher.threads, seconds=seconds, **SEARCHED)
+        width, height = SEARCHED
+        choose(found, shipped_model(), width=width, height=height, threads=launcher.threads, seconds=seconds)
         times.append((surveyed, start.spent()))
     assert found is not None
     work = {"survey": count_survey(found), CHOOSING: {"frame": 1.0}}
