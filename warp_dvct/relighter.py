@@ -52,6 +52,7 @@ class Relighter:
         device: ``cpu``, ``cuda`` or ``cuda:N``. threads: CPU threads; None for all cores.
         real, synthetic: Prim paths whose role is set against what the stage says.
         strict: Treat anything in the stage that is not modelled as an error.
+        purposes, complexity: What is drawn of the stage, and how finely subdivision surfaces; as in ``read_stage``.
         check: Look at what every kernel wrote; a number that is not finite or out of its range is a CheckError that
             names pass, pixel and inputs. About twice as slow.
     Raises:
@@ -76,6 +77,7 @@ class Relighter:
         synthetic: Sequence[str] = (),
         strict: bool = False,
         purposes: Sequence[str] = ("default", "render"),
+        complexity: str = "high",
         check: bool = False,
     ) -> None:
         if method not in METHODS:
@@ -91,6 +93,7 @@ class Relighter:
             "synthetic": synthetic,
             "strict": strict,
             "purposes": purposes,
+            "complexity": complexity,
         }
         self._size = (width, height)
         self._uploaded: tuple[str, DeviceScene, Lit | None] | None = None

@@ -63,7 +63,7 @@ over "World"
         }}
         over "Crate"
         {{
-            uniform token subdivisionScheme = "catmullClark"
+            uniform token subdivisionScheme = "bilinear"
         }}
     }}
 }}

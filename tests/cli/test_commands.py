@@ -14,12 +14,14 @@ from warp_dvct.cli.progress import Progress
 from warp_dvct.cli.relight import relight
 from warp_dvct.cli.warmup import kernel_modules
 from warp_dvct.passes.tonemap import CURVES
+from warp_dvct.usd import refine
 
 
 def test_choices_are_those_of_the_package():
     """They are written down twice, so that --help starts neither Warp nor USD."""
     assert options.METHODS == relighter.METHODS
     assert options.QUALITIES == settings.QUALITIES
+    assert options.COMPLEXITIES == refine.COMPLEXITIES
     (curve,) = (option for option in relight.params if option.name == "curve")
     assert isinstance(curve.type, click.Choice)
     assert tuple(curve.type.choices) == tuple(CURVES)

@@ -204,7 +204,22 @@ def test_polygon_meshes_without_normals_are_faceted(build):
     assert build.one().corner_normals is None
 
 
-def test_subdivision_meshes_are_listed_and_smooth_but_keep_hard_edges(build, measure):
+def test_the_rim_of_a_capped_tube_is_an_edge_between_a_round_side_and_a_flat_cap(build, measure):
+    """Were normals at the rim those of single faces, the side would show as many flat strips."""
+    n = 24
+    angle = np.arange(n) / n * 2 * np.pi
+    ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    points = np.concatenate([ring, ring + np.array([0, 0, 1])])
+    sides = [[k, (k + 1) % n, n + (k + 1) % n, n + k] for k in range(n)]
+    build.mesh(points, [*sides, [n + k for k in range(n)]], scheme="catmullClark")
+    tube = build.one(complexity="low")
+    cap = measure.face_normals(tube)[:, 2] > 0.5
+    np.testing.assert_allclose(tube.corner_normals[cap], np.broadcast_to([0, 0, 1], (n - 2, 3, 3)), atol=1e-6)
+    corners = tube.points[tube.triangles][~cap] * [1, 1, 0]
+    assert (np.einsum("tck,tck->tc", corners, tube.corner_normals[~cap]) > np.cos(np.radians(5))).all()
+
+
+def test_control_meshes_are_listed_and_smooth_but_keep_hard_edges(build, measure):
     n = 24
     angle = np.arange(n) / n * 2 * np.pi
     ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
@@ -212,7 +227,7 @@ def test_subdivision_meshes_are_listed_and_smooth_but_keep_hard_edges(build, mea
     sides = [[k, (k + 1) % n, n + (k + 1) % n, n + k] for k in range(n)]
     build.mesh(points, sides, "/World/Tube", "catmullClark")
     build.mesh(CUBE_POINTS, CUBE_FACES, "/World/Box", "catmullClark")
-    scene = build.read()
+    scene = build.read(complexity="low")
     tube, box = (next(m for m in scene.meshes if m.path == p) for p in ("/World/Tube", "/World/Box"))
     corners = tube.points[tube.triangles]
     radial = corners * [1, 1, 0] / np.linalg.norm(corners[..., :2], axis=-1, keepdims=True)

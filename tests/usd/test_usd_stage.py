@@ -179,7 +179,7 @@ def test_strict_accepts_a_stage_without_notices(build):
 
 
 def test_a_notice_comes_once_per_prim_however_often_it_is_instanced(build):
-    build.mesh([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [[0, 1, 2]], "/Proto/Mesh", "catmullClark")
+    build.mesh([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [[0, 1, 2]], "/Proto/Mesh", "bilinear")
     build.stage.GetPrimAtPath("/Proto").SetSpecifier(Sdf.SpecifierClass)
     for k in range(3):
         prim = build.stage.DefinePrim(f"/World/I{k}")
@@ -274,7 +274,10 @@ def test_the_teapot_asset(build, measure, variant, textures):
     assert len(scene.textures) == textures
     material = scene.materials[mesh.materials[0]]
     assert material.ior == pytest.approx(1.327)
-    assert any("control mesh" in n.message for n in scene.notices)
+    assert not any("control mesh" in n.message for n in scene.notices)
+    (low,) = [m for m in build.read(complexity="low").meshes if m.path == mesh.path]
+    assert len(mesh.triangles) > 15 * len(low.triangles)
+    assert measure.volume(mesh) == pytest.approx(measure.volume(low), rel=0.05)
     if variant == "Utah":
         assert material.base_color == pytest.approx((0.325, 0.825, 0.0))
     else:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 METHODS = ("delta-cones", "instant-radiosity", "path-trace")
 QUALITIES = ("draft", "balanced", "high")
+COMPLEXITIES = ("low", "medium", "high", "veryhigh")
 PURPOSES = ("default", "render", "proxy", "guide")
 
 
@@ -93,6 +94,14 @@ _STAGE_OPTIONS = (
         metavar="NAMES",
         callback=_split_purposes,
         help="Purposes of geometry to draw, of default, render, proxy and guide; default is always drawn.",
+    ),
+    click.option(
+        "--complexity",
+        "-c",
+        type=click.Choice(COMPLEXITIES),
+        default="high",
+        show_default=True,
+        help="How finely subdivision surfaces are drawn; low draws their control meshes.",
     ),
     click.option("--strict", is_flag=True, help="What the stage has and this tool does not model is an error."),
 )

@@ -212,7 +212,7 @@ class Run:
         from warp_dvct.capture.live import LiveSource
         from warp_dvct.launch import Launcher
 
-        reading = {key: self.options[key] for key in ("real", "synthetic", "strict", "purposes")}
+        reading = {key: self.options[key] for key in ("real", "synthetic", "strict", "purposes", "complexity")}
         launcher = Launcher(self.options["device"], self.options["threads"])
         source = LiveSource(self.stage, self.real_from, launcher=launcher, **reading)
         if self.width is None:

@@ -39,6 +39,7 @@ class Context:
         metres: Metres per scene unit.
         to_world: 4x4 float64 for row vectors, from stage space to world space (metres, y up).
         notices: Collector.
+        levels: How often subdivision surfaces are refined; 0 draws their control meshes.
     """
 
     stage: Usd.Stage
@@ -46,6 +47,7 @@ class Context:
     metres: float
     to_world: np.ndarray
     notices: Notices = field(default_factory=Notices)
+    levels: int = 2
 
 
 def matrix(value: Any) -> np.ndarray:

@@ -11,6 +11,8 @@ from warp_dvct.errors import StageError
 from warp_dvct.usd.context import Context, transform_points
 from warp_dvct.usd.gprims import read_gprim
 from warp_dvct.usd.primvars import Topology, corner_values
+from warp_dvct.usd.refine import refine
+from warp_dvct.usd.subdivision import SCHEMES
 from warp_dvct.usd.triangulate import has_area, triangulate
 
 if TYPE_CHECKING:
@@ -86,9 +88,12 @@ def _read_mesh(mesh: UsdGeom.Mesh, ctx: Context) -> LocalMesh | None:
         if holes.min() < 0 or holes.max() >= len(counts):
             raise StageError(f"{path}: holeIndices go up to {holes.max()}, but there are {len(counts)} faces")
         keep[holes] = False
-    cut = triangulate(points, counts, indices, keep)
+    refined = refine(mesh, points, counts, indices, ctx)
+    drawn = points if refined is None else refined.vertices(points)
+    parts = (counts, indices, keep) if refined is None else (refined.counts, refined.indices, keep[refined.parents])
+    cut = triangulate(drawn, *parts)
     corners, faces = cut.corners, cut.faces
-    solid = has_area(points, indices[corners])
+    solid = has_area(drawn, parts[1][corners])
     dropped = int((~solid).sum()) + int((counts[keep] < 3).sum())
     if dropped:
         ctx.notices.add(path, f"{dropped} degenerate triangles dropped")
@@ -98,9 +103,12 @@ def _read_mesh(mesh: UsdGeom.Mesh, ctx: Context) -> LocalMesh | None:
         corners, faces = corners[solid], faces[solid]
     if _left_handed(prim, ctx):
         corners = corners[:, ::-1]
-    topology = Topology(indices[corners], corners, faces, len(points), len(indices), len(counts))
+    of_face = faces if refined is None else refined.parents[faces]
+    topology = Topology(parts[1][corners], corners, of_face, len(points), len(indices), len(counts), refined)
     double_sided = bool(mesh.GetDoubleSidedAttr().Get(ctx.time))
-    return LocalMesh(points, topology, _normals(mesh, points, topology, ctx), None, double_sided)
+    # Normals that are authored on a subdivision mesh are not the surface's: UsdGeom asks to ignore them.
+    normals = _normals(mesh, points, topology, ctx) if refined is None else _smooth(drawn, topology.triangles)
+    return LocalMesh(drawn, topology, normals, None, double_sided)
 
 
 def _check_mesh(path: str, points: np.ndarray, counts: np.ndarray, indices: np.ndarray) -> None:
@@ -125,10 +133,7 @@ def _normals(mesh: UsdGeom.Mesh, points: np.ndarray, topology: Topology, ctx: Co
     from pxr import UsdGeom
 
     path = str(mesh.GetPath())
-    scheme = mesh.GetSubdivisionSchemeAttr().Get(ctx.time)
-    subdivided = scheme not in (UsdGeom.Tokens.none, UsdGeom.Tokens.bilinear)
-    if scheme != UsdGeom.Tokens.none:
-        ctx.notices.add(path, f"subdivisionScheme is {scheme}: drawn as its control mesh")
+    subdivided = mesh.GetSubdivisionSchemeAttr().Get(ctx.time) in SCHEMES
     primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
     authored = mesh.GetNormalsAttr()
     if not (primvar and primvar.HasAuthoredValue()):
@@ -137,7 +142,7 @@ def _normals(mesh: UsdGeom.Mesh, points: np.ndarray, topology: Topology, ctx: Co
             return _unit(_attribute_normals(mesh, topology, ctx), points, topology)
     else:
         return _unit(corner_values(primvar, ctx, topology, 3, path), points, topology)
-    return _smooth(points, topology) if subdivided else None
+    return _smooth(points, topology.triangles) if subdivided else None
 
 
 def _attribute_normals(mesh: UsdGeom.Mesh, topology: Topology, ctx: Context) -> np.ndarray | None:
@@ -172,25 +177,51 @@ def _unit(normals: np.ndarray | None, points: np.ndarray, topology: Topology) ->
     return normals / length
 
 
-def _smooth(points: np.ndarray, topology: Topology) -> np.ndarray:
-    """Point normals weighted by the corners' angles; at a crease a corner keeps its own face's normal.
+def _smooth(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Point normals weighted by the corners' angles; at a crease those of the faces on the corner's own side.
 
     Angles do not depend on how a face was cut into triangles (Thuermer and Wuethrich 1998).
     """
-    triangles = topology.triangles
     face = _face_normals(points, triangles)
     face /= np.linalg.norm(face, axis=1, keepdims=True)
-    summed = np.zeros((len(points), 3))
+    weighted = face[:, None] * _angles(points, triangles)[..., None]
+    summed = np.stack(
+        [np.bincount(triangles.ravel(), weighted[..., axis].ravel(), len(points)) for axis in range(3)], 1
+    )
+    summed /= np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-300)
+    corners = summed[triangles]
+    hard = np.einsum("tck,tk->tc", corners, face) < CREASE_COSINE
+    if hard.any():
+        corners[hard] = _own_side(triangles, face, weighted, hard)
+    return corners
+
+
+def _angles(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Of each triangle at each of its corners, ``[t, 3]``."""
+    angles = np.empty(triangles.shape)
     for k in range(3):
         at = points[triangles[:, k]]
         a, b = points[triangles[:, (k + 1) % 3]] - at, points[triangles[:, (k + 2) % 3]] - at
-        angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("tk,tk->t", a, b))
-        for axis in range(3):
-            summed[:, axis] += np.bincount(triangles[:, k], face[:, axis] * angle, len(points))
-    summed /= np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-300)
-    corners = summed[triangles]
-    soft = np.einsum("tck,tk->tc", corners, face) >= CREASE_COSINE
-    return np.where(soft[..., None], corners, face[:, None])
+        angles[:, k] = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("tk,tk->t", a, b))
+    return angles
+
+
+def _own_side(triangles: np.ndarray, face: np.ndarray, weighted: np.ndarray, hard: np.ndarray) -> np.ndarray:
+    """Normals ``[n, 3]`` of the ``hard`` corners from the faces at their point that lean less than a crease from their
+    own, which keeps both the edge and what is round beside it, as at the rim of a cylinder."""
+    order = np.argsort(triangles.ravel(), kind="stable")
+    number = np.bincount(triangles.ravel())
+    first = np.cumsum(number) - number
+    asked = np.flatnonzero(hard.ravel())
+    around = number[triangles.ravel()[asked]]
+    row = np.repeat(np.arange(len(asked)), around)
+    step = np.arange(len(row)) - np.repeat(np.cumsum(around) - around, around)
+    other = order[np.repeat(first[triangles.ravel()[asked]], around) + step]
+    own = face[asked // 3][row]
+    near = np.einsum("rk,rk->r", own, face[other // 3]) >= CREASE_COSINE
+    values = weighted.reshape(-1, 3)[other[near]]
+    summed = np.stack([np.bincount(row[near], values[:, axis], len(asked)) for axis in range(3)], 1)
+    return summed / np.linalg.norm(summed, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True)

@@ -179,7 +179,7 @@ def _cylinder(e: _Emitter, value: np.ndarray, common: dict[str, Any]) -> list[Li
     if _shaping(e):
         e.note("shaping of a CylinderLight is not modelled: it shines all round")
     e.note(f"a CylinderLight is drawn as a prism of {TUBE_FACES} RectLights")
-    length, radius = e.size("inputs:length"), e.size("inputs:radius")
+    length, radius, path = e.size("inputs:length"), e.size("inputs:radius"), common.pop("path")
     half = np.pi / TUBE_FACES
     rim = radius * half / np.sin(half)  # of the prism, so that its outline is as long as the circle
     faces = []
@@ -199,7 +199,8 @@ def _cylinder(e: _Emitter, value: np.ndarray, common: dict[str, Any]) -> list[Li
             axis_y=_rgb(y),
             position=_rgb(position),
             direction=_rgb(normal),
-            **common | {"path": f"{common['path']}.face{number}"},
+            path=f"{path}.face{number}",
+            **common,
         )
         for number, (x, y, position, normal) in enumerate(faces)
     ]

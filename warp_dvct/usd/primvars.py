@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from pxr import UsdGeom
 
     from warp_dvct.usd.context import Context
+    from warp_dvct.usd.subdivision import Refinement
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,7 @@ class Topology:
         corners: Face-vertices of each triangle, int64 ``[t, 3]``.
         faces: Face of each triangle, int64 ``[t]``.
         point_count, corner_count, face_count: Sizes that vertex, faceVarying and uniform values must have.
+        refined: Of a subdivision surface: brings such values to the points and face-vertices that triangles refer to.
     """
 
     triangles: np.ndarray
@@ -32,6 +34,7 @@ class Topology:
     point_count: int
     corner_count: int
     face_count: int
+    refined: Refinement | None = None
 
 
 def flat_values(primvar: UsdGeom.Primvar, ctx: Context, width: int) -> np.ndarray | None:
@@ -81,8 +84,16 @@ def spread(values: np.ndarray, interpolation: str, topology: Topology) -> np.nda
     if interpolation == "uniform":
         return np.repeat(values[t.faces][:, None], 3, 1) if len(values) == t.face_count else None
     if interpolation in ("vertex", "varying"):
-        return values[t.triangles] if len(values) == t.point_count else None
-    return values[t.corners] if len(values) == t.corner_count else None
+        if len(values) != t.point_count:
+            return None
+        if t.refined is None:
+            return values[t.triangles]
+        if interpolation == "vertex":
+            return t.refined.vertices(values)[t.triangles]
+        return t.refined.corners(values[t.refined.cage.indices])[t.corners]
+    if len(values) != t.corner_count:
+        return None
+    return (values if t.refined is None else t.refined.corners(values))[t.corners]
 
 
 def corner_values(

@@ -20,6 +20,7 @@ from warp_dvct.usd.lights import read_lights
 from warp_dvct.usd.materials import Look, Materials
 from warp_dvct.usd.points import LocalPoints, placed_radii, read_points
 from warp_dvct.usd.primvars import corner_values
+from warp_dvct.usd.refine import refinement_levels
 from warp_dvct.usd.roles import Roles, require_roles
 from warp_dvct.usd.stage import name_of, note_composition_errors, open_stage, quiet_diagnostics, world_frame
 from warp_dvct.usd.textures import ImageCache
@@ -38,6 +39,7 @@ def read_stage(
     plate: str | os.PathLike | None = None,
     strict: bool = False,
     purposes: Sequence[str] = ("default", "render"),
+    complexity: str = "high",
     render_pass: str | None = None,
     allow_empty_roles: bool = False,
     images: ImageCache | None = None,
@@ -54,6 +56,8 @@ def read_stage(
         plate: Photograph; overrides the camera's ``dvct:plate:file``.
         strict: Refuse a stage in which something is met that is not modelled.
         purposes: UsdGeom purposes that are drawn.
+        complexity: How often subdivision surfaces are refined, in usdrecord's words: ``low`` (not at all, their control
+            meshes are drawn), ``medium`` (once), ``high`` (twice) or ``veryhigh``.
         render_pass: UsdRenderPass whose matte collection marks real prims; None for the only one.
         allow_empty_roles: Accept a stage that defines nothing real or nothing synthetic. Prims that are defined but
             invisible at this time are accepted always.
@@ -64,7 +68,7 @@ def read_stage(
         The scene in metres, y up; its ``notices`` list what was met and is not modelled.
     Raises:
         StageError: The stage or something in it cannot be used; the message names the prim or file.
-        FileError: ``plate`` does not exist.
+        FileError: ``plate`` does not exist. OptionError: ``complexity`` is another word.
     """
     from pxr import Usd
 
@@ -72,7 +76,7 @@ def read_stage(
     with quiet_diagnostics():
         metres, frame = world_frame(stage)
         code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(time)
-        ctx = Context(stage, code, metres, frame)
+        ctx = Context(stage, code, metres, frame, levels=refinement_levels(complexity))
         note_composition_errors(stage, ctx.notices)
         broken = ctx.notices.all()
         try:
