@@ -9,6 +9,8 @@ import lit_scenes as lit
 import numpy as np
 import pytest
 
+from warp_dvct import plan as planning
+from warp_dvct.passes.voxels import Box
 from warp_dvct.plan import make_plan
 from warp_dvct.scene import Light, LightKind, LightRole, Material, Role
 from warp_dvct.settings import make_settings
@@ -258,3 +260,31 @@ def test_cones_under_a_dome_need_the_volume_without_bounces():
     assert needed(plan)["voxelize"]
     assert needed(plan)["pyramid"]
     assert not needed(plan_of(room(light(LightKind.DOME)), bounces=0))["voxelize"], "rays need none"
+
+
+def test_surface_inside_of_boxes_is_that_of_a_loop(monkeypatch):
+    """Random triangles in several blocks, against a sum triangle by triangle; bounds leave unused points out."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 2, (40, 1, 3)) + rng.uniform(-0.2, 0.2, (40, 3, 3))
+    points[34:] *= 50.0  # so large that the border bounds what they count for
+    points[:10] = rng.uniform(0.2, 0.8, (10, 3, 3))  # a block of its own, inside of both boxes
+    unused = np.full((1, 3), 99.0)
+    triangles = np.arange(120, dtype=np.int32).reshape(40, 3)
+    mesh = replace(room().meshes[0], points=np.concatenate([points.reshape(-1, 3), unused]), triangles=triangles)
+    scene = replace(room(), meshes=(mesh,), point_clouds=())
+    np.testing.assert_array_equal(scene.bounds(), (points.reshape(-1, 3).min(0), points.reshape(-1, 3).max(0)))
+    origin, scale = np.array([-0.1, 0.0, 0.1]), 0.9
+    boxes = Box((0.0, 0.0, 0.0), 1.0, 8), Box((-0.5, -0.4, -0.3), 1.8, 8)
+    monkeypatch.setattr(planning, "TRIANGLES_AT_ONCE", 10)
+    found = planning.surface_areas(scene, boxes, scale, origin)
+    for box, area in zip(boxes, found, strict=True):
+        low, high = np.array(box.low), np.array(box.low) + box.edge
+        whole, cut, crossing = 0.0, 0.0, 0
+        for corners in (points - origin) * scale:
+            size = 0.5 * np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0]))
+            if np.all((corners.mean(0) >= low) & (corners.mean(0) <= high)):
+                whole += size
+            elif np.all(corners.min(0) <= high) and np.all(corners.max(0) >= low):
+                cut, crossing = cut + size, crossing + 1
+        assert crossing > 0
+        assert area == pytest.approx(whole + min(cut, 2.0 * box.edge**2 * crossing))

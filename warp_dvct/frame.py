@@ -18,6 +18,7 @@ from warp_dvct.scene import Role, Scene
 STEPS_PER_OCTAVE = 4  # of the fine volume's edge: it is within 2**(1/8), 9 %, of what volume.scale asks for
 STEPS_PER_EDGE = 8  # of the fine volume's centre: it is within a sixteenth of the edge from the objects' middle
 SPLIT_TO = 0.25  # of the coarse volume's half edge: triangles that cross its border are split until they are that small
+_UNIT = ([np.zeros(3)], [np.ones(3)])  # bounds of a scene without geometry
 ALMOST = 0.05  # of a step: objects may stand out of the real scene that far, less than the coarse volume's margin
 
 
@@ -44,8 +45,9 @@ def volume_frame(scene: Scene, volume_scale: float) -> VolumeFrame:
     never so small that the box is not inside. Without real or without synthetic geometry nothing can be kept, and the
     volume is exactly that large and centred.
     """
-    everything = scene.bounds() or (np.zeros(3), np.ones(3))
     synthetic, real = scene.bounds(Role.SYNTHETIC), scene.bounds(Role.REAL)
+    lows, highs = zip(*(b for b in (synthetic, real) if b is not None), strict=True) if synthetic or real else _UNIT
+    everything = np.min(lows, 0), np.max(highs, 0)
     low, high = synthetic if synthetic is not None else everything
     smallest = 1e-6 * (float(np.max(everything[1] - everything[0])) or 1.0)
     size = float(np.max(high - low))

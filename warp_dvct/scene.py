@@ -234,6 +234,13 @@ class Notice:
         return f"{self.path}: {self.message}"
 
 
+def _used_points(mesh: Mesh) -> np.ndarray:
+    """Those that a triangle has for a corner, each once."""
+    used = np.zeros(len(mesh.points), bool)
+    used[mesh.triangles.ravel()] = True
+    return mesh.points if used.all() else mesh.points[used]
+
+
 @dataclass(frozen=True)
 class Scene:
     """Everything that a picture needs, at one time code.
@@ -254,7 +261,7 @@ class Scene:
 
     def bounds(self, role: Role | None = None) -> tuple[np.ndarray, np.ndarray] | None:
         """Axis-aligned bounds (low, high) in metres of the geometry of a role, or of all; None where there is none."""
-        points = [m.points[m.triangles.ravel()] for m in self.meshes if role is None or m.role == role]
+        points = [_used_points(m) for m in self.meshes if role is None or m.role == role]
         points += [c.points for c in self.point_clouds if role is None or c.role == role]
         points = [p for p in points if len(p)]
         if not points:
