@@ -155,7 +155,7 @@ def test_voxels_and_patches_are_those_of_a_frame(surveys):
         fragments = sum(v.fragments.count for v in lit.volumes)
         assert 1e6 * counts["records"] == pytest.approx(records, rel=0.1)
         assert 1e6 * counts["fragments"] == pytest.approx(fragments, rel=0.25)
-        patches = lit.bounces.real.shape[0]
+        patches = lit.bounces.irradiance.shape[0] // 2
         assert _patches(settings, room, room.coarse, 64) == pytest.approx(patches, rel=0.3)
 
 

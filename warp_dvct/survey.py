@@ -246,7 +246,7 @@ def _pilot(scene: Scene, device_scene: DeviceScene, launcher: Launcher, plan: Pl
     patches = 0.0
     if lit.bounces.present:
         records = lit.volumes[-1].level_records[lit.bounces.level]
-        patches = lit.bounces.real.shape[0] / max(records, 1)
+        patches = lit.bounces.irradiance.shape[0] // 2 / max(records, 1)  # before and after
     focusing = glossy_hits(launcher, scene, device_scene, lit.bounces, 0) is not None
     layers, affected, change = None, 0.0, 0.0
     if plan.changes:
