@@ -6,20 +6,34 @@ A patch's rays are traced once; every further bounce only follows the links from
 import warp as wp
 
 from warp_dvct.kernels.bounce_field import (
+    Bounced,
     BounceField,
+    Patch,
+    bounced_at_home,
     bounced_irradiance,
+    home_of,
     is_parted,
     off_surface,
+    own_patch,
     record_of,
     wall_beside,
     wall_side,
 )
 from warp_dvct.kernels.geometry import FAR, Geometry, Hit, trace_real, trace_synthetic
 from warp_dvct.kernels.materials import Materials, Surface, hemispherical_albedo, spawn_point
-from warp_dvct.kernels.patches import Patches, fragment_surface
+from warp_dvct.kernels.patches import (
+    LIFT,
+    Fragments,
+    fragment_position,
+    fragment_surface,
+    fragments_end,
+    largest_fragment,
+    outlook,
+    sees,
+)
 from warp_dvct.kernels.radiosity import World, radiosity_at
 from warp_dvct.kernels.sampling import PI, cosine_hemisphere, from_frame, sobol2
-from warp_dvct.kernels.volume import Volume, brick_extent, face_of, key_cell
+from warp_dvct.kernels.volume import Volume, brick_extent, face_of, face_weight, key_cell
 
 wp.set_module_options({"enable_backward": False})
 
@@ -38,98 +52,142 @@ def _mean_albedo(
     records: int,
     albedo_out: wp.array(dtype=wp.vec3),
 ):
-    """Area-weighted albedo of a record's surfaces, before and after."""
+    """Area-weighted albedo of a record's surfaces, of the real and of the synthetic ones; 0 where there are none."""
     i = first + wp.tid()
     end = fragments
     if i + 1 < records:
         end = record_start_in[i + 1]
     real = wp.vec3(0.0, 0.0, 0.0)
-    every = wp.vec3(0.0, 0.0, 0.0)
+    synthetic = wp.vec3(0.0, 0.0, 0.0)
     real_area = float(0.0)
-    area = float(0.0)
+    synthetic_area = float(0.0)
     for j in range(record_start_in[i], end):
         fragment = order_in[j]
         triangle = triangle_in[fragment]
         place = fragment_in[fragment]
         s = fragment_surface(geo, mats, triangle, wp.vec3(place[0], place[1], place[2]), -normal_in[triangle])
         albedo = hemispherical_albedo(s) * place[3]
-        every += albedo
-        area += place[3]
         if triangle < geo.synthetic_first:
             real += albedo
             real_area += place[3]
+        else:
+            synthetic += albedo
+            synthetic_area += place[3]
     albedo_out[2 * i] = real / wp.max(real_area, 1.0e-20)
-    albedo_out[2 * i + 1] = every / wp.max(area, 1.0e-20)
+    albedo_out[2 * i + 1] = synthetic / wp.max(synthetic_area, 1.0e-20)
 
 
 @wp.struct
 class PatchHits:
     """What the rays of an earlier frame's patches met in the real scene."""
 
-    count: wp.int32  # patches
-    place: wp.array(dtype=wp.int64)
-    position: wp.array(dtype=wp.vec3)
-    normal: wp.array(dtype=wp.vec3)
-    reach: wp.array(dtype=wp.float32)
+    count: wp.int32
+    patches: wp.array(dtype=Patch)
     distance: wp.array(dtype=wp.float32)  # [count * rays]
     triangle: wp.array(dtype=wp.int32)  # [count * rays], -1 where a ray meets nothing
 
 
 @wp.func
-def patch_behind(field: BounceField, record: int, normal: wp.vec3) -> int:
-    """The patch behind the face that a normal shows on most, then on less; -1 for none."""
-    best = int(-1)
-    most = float(0.0)
-    for axis in range(3):
-        share = wp.abs(normal[axis])
-        patch = field.table[(record - field.level_first) * 6 + face_of(axis, normal[axis])]
-        if patch >= 0 and share > most:
-            most = share
-            best = patch
+def seen_patch(geo: Geometry, field: BounceField, head: int, guess: int, eye: wp.vec3, synthetic: int) -> int:
+    """Of the patches of a role behind one face: ``guess``, or one that a free place above the point sees instead."""
+    best = int(guess)
+    if not sees(geo, eye, field.patches[guess].eye):
+        searching = bool(True)
+        patch = int(head)
+        while searching and patch >= 0:
+            other = field.patches[patch]
+            if patch != guess and other.real != synthetic and sees(geo, eye, other.eye):
+                best = patch
+                searching = False
+            patch = other.next
     return best
 
 
 @wp.func
-def patch_at(field: BounceField, position: wp.vec3, normal: wp.vec3) -> int:
+def patch_behind(
+    geo: Geometry,
+    field: BounceField,
+    record: int,
+    position: wp.vec3,
+    normal: wp.vec3,
+    eye: wp.vec3,
+    synthetic: int,
+) -> int:
+    """The patch of a surface point behind the face that its normal shows on most, then on less, one of its own role
+    before others; -1 for none."""
+    first = int(-1)
+    best = int(-1)
+    most = float(0.0)
+    for axis in range(3):
+        share = wp.abs(normal[axis])
+        if share + 1.0 > most:
+            head = field.table[(record - field.level_first) * 6 + face_of(axis, normal[axis])]
+            if head >= 0:
+                patch = int(head)
+                if field.patches[head].next >= 0:
+                    patch = own_patch(field, head, position, synthetic)
+                share += wp.where(field.patches[patch].real != synthetic, 1.0, 0.0)
+                if share > most:
+                    most = share
+                    best = patch
+                    first = head
+    if best >= 0:
+        if field.patches[first].next >= 0:
+            best = seen_patch(geo, field, first, best, eye, synthetic)
+    return best
+
+
+@wp.func
+def patch_at(
+    geo: Geometry,
+    field: BounceField,
+    position: wp.vec3,
+    normal: wp.vec3,
+    eye: wp.vec3,
+    synthetic: int,
+) -> int:
     """The patch of a surface point; where a thin wall parts it from its voxel's, that of the next voxel on its side."""
     record = record_of(field, position)
     if record < 0:
         return -1
-    best = patch_behind(field, record, normal)
+    best = patch_behind(geo, field, record, position, normal, eye, synthetic)
     if best >= 0 and field.has_walls != 0:
         point = off_surface(field, position, normal)
         wall = wall_beside(field, point)
-        if is_parted(wall, point, field.position[best]):
+        if is_parted(wall, point, field.patches[best].position):
             size = field.volume.voxel * float(1 << field.level)
             away = wp.vec3(wall[0], wall[1], wall[2]) * (wp.sign(wall_side(wall, point)) * size)
             record = record_of(field, position + away)
             if record >= 0:
-                other = patch_behind(field, record, normal)
-                if other >= 0 and not is_parted(wall, point, field.position[other]):
+                other = patch_behind(geo, field, record, position, normal, eye, synthetic)
+                if other >= 0 and not is_parted(wall, point, field.patches[other].position):
                     best = other
     return best
 
 
 @wp.func
-def find_patch(hits: PatchHits, patches: Patches, i: int) -> int:
+def find_patch(hits: PatchHits, patches: wp.array(dtype=Patch), i: int) -> int:
     """The same patch among those of an earlier frame, or -1: the same place, and the same surface in it."""
-    place = patches.place[i]
+    place = patches[i].place
     low = int(0)
     high = int(hits.count)
     while low < high:
         middle = (low + high) / 2
-        if hits.place[middle] < place:
+        if hits.patches[middle].place < place:
             low = middle + 1
         else:
             high = middle
-    if low >= hits.count:
-        return -1
-    if hits.place[low] != place or hits.reach[low] != patches.reach[i]:
-        return -1
-    for axis in range(3):
-        if hits.position[low][axis] != patches.position[i][axis] or hits.normal[low][axis] != patches.normal[i][axis]:
+    while low < hits.count:
+        if hits.patches[low].place != place:
             return -1
-    return low
+        if (
+            hits.patches[low].reach == patches[i].reach
+            and wp.length_sq(hits.patches[low].position - patches[i].position) == 0.0
+            and wp.length_sq(hits.patches[low].normal - patches[i].normal) == 0.0
+        ):
+            return low
+        low += 1
+    return -1
 
 
 @wp.kernel
@@ -137,7 +195,7 @@ def _link_patches(
     first: int,
     geo: Geometry,
     world: World,
-    patches: Patches,
+    patches: wp.array(dtype=Patch),
     field: BounceField,
     last: PatchHits,
     rays: int,
@@ -151,16 +209,17 @@ def _link_patches(
     i = first + wp.tid()
     known = find_patch(last, patches, i)
     # Random numbers go by place, not by rank, which depends on what else there is.
-    index = int(patches.place[i] / wp.int64(6))
-    face = int(patches.place[i] % wp.int64(6))
-    normal = patches.normal[i]
+    index = int(patches[i].place / wp.int64(6))
+    face = int(patches[i].place % wp.int64(6))
+    normal = patches[i].normal
     s = Surface()
-    s.position = patches.position[i]
+    s.position = patches[i].position
     s.normal_g = normal
-    s.reach = patches.reach[i]
+    s.reach = patches[i].reach
     before = wp.vec3(0.0, 0.0, 0.0)
     after = wp.vec3(0.0, 0.0, 0.0)
     width = wp.sqrt(PI / float(rays))
+    lift = LIFT * field.volume.voxel * float(1 << field.level)
     for k in range(rays):
         direction = from_frame(cosine_hemisphere(sobol2(seed, index, k, 23 + face)), normal)
         origin = spawn_point(s, direction)
@@ -181,7 +240,8 @@ def _link_patches(
             position = origin + direction * real.t
             light = radiosity_at(world, position, n, width * real.t)
             before += light.before
-            link[0] = patch_at(field, position, n)
+            eye = origin + direction * wp.max(real.t - lift, 0.5 * real.t)
+            link[0] = patch_at(geo, field, position, n, eye, 0)
             if synthetic.found == 0:
                 after += light.after
                 link[1] = link[0]
@@ -191,7 +251,8 @@ def _link_patches(
             position = origin + direction * synthetic.t
             light = radiosity_at(world, position, n, width * synthetic.t)
             after += light.after
-            link[1] = patch_at(field, position, n)
+            eye = origin + direction * wp.max(synthetic.t - lift, 0.5 * synthetic.t)
+            link[1] = patch_at(geo, field, position, n, eye, 1)
         link_out[i * rays + k] = link
     irradiance_out[2 * i] = before / float(rays)
     irradiance_out[2 * i + 1] = after / float(rays)
@@ -200,7 +261,7 @@ def _link_patches(
 @wp.kernel
 def _bounce(
     first: int,
-    patches: Patches,
+    patches: wp.array(dtype=Patch),
     link_in: wp.array(dtype=wp.vec2i),
     rays: int,
     irradiance_in: wp.array(dtype=wp.vec3),
@@ -220,11 +281,11 @@ def _bounce(
         link = link_in[i * rays + k]
         if link[0] < 0:
             known += 1.0
-        elif patches.real[link[0]] != 0:
+        elif patches[link[0]].real != 0:
             known += 1.0
-            before += wp.cw_mul(patches.albedo[link[0]], irradiance_in[2 * link[0]])
+            before += wp.cw_mul(patches[link[0]].albedo, irradiance_in[2 * link[0]])
         if link[1] >= 0:
-            after += wp.cw_mul(patches.albedo[link[1]], irradiance_in[2 * link[1] + 1])
+            after += wp.cw_mul(patches[link[1]].albedo, irradiance_in[2 * link[1] + 1])
     before = before / wp.max(known, 1.0)
     after = after / float(rays)
     irradiance_out[2 * i] = before
@@ -233,25 +294,116 @@ def _bounce(
     total_out[2 * i + 1] += after
 
 
+@wp.func
+def shown_area(
+    geo: Geometry, normals: wp.array(dtype=wp.vec3), pieces: Fragments, record: int, face: int, role: int
+) -> float:
+    """Projected area that a role's surfaces in a record show on one face."""
+    total = float(0.0)
+    for j in range(pieces.record_start[record], fragments_end(pieces, record)):
+        fragment = pieces.order[j]
+        triangle = pieces.triangle[fragment]
+        if role == wp.where(triangle >= geo.synthetic_first, 1, 0):
+            shown = face_weight(normals[triangle], face)
+            if geo.double_sided[triangle] != 0:
+                shown += face_weight(-normals[triangle], face)
+            total += shown * pieces.place[fragment][3]
+    return total
+
+
+@wp.struct
+class Received:
+    """Irradiance of a piece of surface, and whether something covers it closely."""
+
+    light: Bounced
+    buried: wp.int32
+
+
+@wp.func
+def received(
+    geo: Geometry,
+    normals: wp.array(dtype=wp.vec3),
+    pieces: Fragments,
+    field: BounceField,
+    record: int,
+    face: int,
+    center: wp.vec3,
+    axis: wp.vec3,
+    role: int,
+) -> Received:
+    """What a role's surfaces behind a record's face get; where there are several sheets, its largest piece tells which
+    one that is."""
+    result = Received()
+    position = center
+    home = home_of(field, position, axis, role)
+    if home.several != 0:
+        fragment = largest_fragment(geo, normals, pieces, record, face, role)
+        position = fragment_position(pieces, fragment)
+        home = home_of(field, position, axis, role)
+        voxel = record_of(field, off_surface(field, position, axis)) - field.level_first
+        if home.several != 0 and voxel >= 0:
+            lift = LIFT * field.volume.voxel * float(1 << field.level)
+            look = outlook(geo, normals, pieces, fragment, face, 0.0, lift)
+            head = field.table[voxel * 6 + face]
+            own = seen_patch(geo, field, head, home.own[face / 2], look.eye, role)
+            home.own[face / 2] = own
+            result.buried = field.patches[own].buried
+    result.light = bounced_at_home(field, position, axis, home)
+    return result
+
+
 @wp.kernel
 def _reinject(
     first: int,
+    geo: Geometry,
+    normal_in: wp.array(dtype=wp.vec3),
     key_in: wp.array(dtype=wp.int32),
     target: Volume,
     area_in: wp.array(dtype=wp.vec2),
+    pieces: Fragments,
     albedo_in: wp.array(dtype=wp.vec3),
     field: BounceField,
     flux_out: wp.array(dtype=wp.vec3),
 ):
-    """Add what a record's faces reflect of the bounces."""
+    """Add what a record's faces reflect of the bounces.
+
+    Where real and synthetic surfaces share a face, each reflects what it gets itself; one that an object covers is not
+    seen and leaves its share of the face to the object.
+    """
     i = first + wp.tid()
     cell = key_cell(key_in[i], brick_extent(target.n, 0))
     center = wp.vec3(float(cell[0]) + 0.5, float(cell[1]) + 0.5, float(cell[2]) + 0.5) * target.voxel + target.low
+    # Real fragments come first.
+    has_real = pieces.triangle[pieces.order[pieces.record_start[i]]] < geo.synthetic_first
+    has_synthetic = pieces.triangle[pieces.order[fragments_end(pieces, i) - 1]] >= geo.synthetic_first
+    record = record_of(field, center)
+    mixed = bool(True)
+    if record >= 0:
+        mixed = field.mixed[record - field.level_first] != 0
     for face in range(6):
         area = area_in[i * 6 + face]
         if area[1] > 0.0:
             axis = wp.vec3(0.0, 0.0, 0.0)
             axis[face / 2] = wp.where((face & 1) == 0, 1.0, -1.0)
-            light = bounced_irradiance(field, center, axis)
-            flux_out[(i * 6 + face) * 2] += wp.cw_mul(albedo_in[2 * i], light.before) * area[0]
-            flux_out[(i * 6 + face) * 2 + 1] += wp.cw_mul(albedo_in[2 * i + 1], light.after) * area[1]
+            before = wp.vec3(0.0, 0.0, 0.0)
+            after = wp.vec3(0.0, 0.0, 0.0)
+            real_share = wp.where(has_real, 1.0, 0.0)
+            if mixed:
+                if has_real and has_synthetic:
+                    real = shown_area(geo, normal_in, pieces, i, face, 0)
+                    real_share = real / wp.max(real + shown_area(geo, normal_in, pieces, i, face, 1), 1.0e-20)
+                if real_share > 0.0:
+                    got = received(geo, normal_in, pieces, field, i, face, center, axis, 0)
+                    before = wp.cw_mul(albedo_in[2 * i], got.light.before)
+                    if got.buried != 0 and real_share < 1.0:
+                        real_share = 0.0
+                    after = wp.cw_mul(albedo_in[2 * i], got.light.after) * real_share
+                if real_share < 1.0:
+                    added = received(geo, normal_in, pieces, field, i, face, center, axis, 1)
+                    after += wp.cw_mul(albedo_in[2 * i + 1], added.light.after) * (1.0 - real_share)
+            else:
+                light = bounced_irradiance(field, center, axis, 0)
+                before = wp.cw_mul(albedo_in[2 * i], light.before)
+                after = wp.cw_mul(albedo_in[2 * i], light.after)
+            flux_out[(i * 6 + face) * 2] += before * area[0]
+            flux_out[(i * 6 + face) * 2 + 1] += after * area[1]

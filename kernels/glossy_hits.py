@@ -159,7 +159,7 @@ def focused(
     diffuse = hemispherical_albedo_diffuse(s)
     specular = hemispherical_albedo_specular(s)
     keep = divided(diffuse, diffuse + specular)
-    bounced = bounced_irradiance(hits.bounces, s.position, s.normal_g)
+    bounced = bounced_irradiance(hits.bounces, s.position, s.normal_g, s.synthetic)
     s.alpha = wp.min(wp.sqrt(s.alpha * s.alpha + solid_angle / PI), 1.0)
     share = divided(specular, hemispherical_albedo_specular(s))  # widening costs energy at grazing angles
     brightest = wp.max(even.after, even.before)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_dvct.kernels.bounce_field import BounceField, off_surface, wall_beside
+from warp_dvct.kernels.bounce_field import NEIGHBOURS, BounceField, Patch, neighbour_step, off_surface, wall_beside
 from warp_dvct.kernels.geometry import (
     FAR,
     OFFSET_RELATIVE,
@@ -10,6 +10,8 @@ from warp_dvct.kernels.geometry import (
     Hit,
     corner_position,
     largest_coordinate,
+    occluded_by_real,
+    occluded_by_synthetic,
     trace_all,
 )
 from warp_dvct.kernels.materials import Materials, Surface, hemispherical_albedo, surface_at
@@ -21,6 +23,9 @@ WALL_AREA = wp.constant(0.25)  # share of its voxel's face that a side of a thin
 CLEARLY = wp.constant(1.05)  # how much larger a wall has to be than another of the same voxel: equal ones stay in order
 THIN = wp.constant(0.25)  # thickest wall, in voxels of the patches' level
 OPPOSITE = wp.constant(-0.9)  # cosine between the normals of a wall's two sides
+MOST_SHEETS = wp.constant(4)  # patches behind one face
+LIFT = wp.constant(0.25)  # voxels of the patches' level that a patch looks around from above its surface
+ANY = wp.constant(-1)  # role
 
 
 @wp.func
@@ -62,14 +67,12 @@ def _face_keys(
 
 
 @wp.struct
-class Patches:
-    position: wp.array(dtype=wp.vec3)
-    normal: wp.array(dtype=wp.vec3)
-    albedo: wp.array(dtype=wp.vec3)
-    reach: wp.array(dtype=wp.float32)
-    real: wp.array(dtype=wp.int32)
-    area: wp.array(dtype=wp.float32)  # of all that shows on the face, over that of the face
-    place: wp.array(dtype=wp.int64)  # key of the voxel * 6 + face: ascending, and the same whatever else is there
+class Sheets:
+    """Pieces of surface that become patches: ``MOST_SHEETS`` places for each occupied face."""
+
+    fragment: wp.array(dtype=wp.int32)
+    eye: wp.array(dtype=wp.vec3)
+    buried: wp.array(dtype=wp.int32)
 
 
 @wp.struct
@@ -85,22 +88,30 @@ class Fragments:
 
 
 @wp.func
-def largest_fragment(geo: Geometry, normals: wp.array(dtype=wp.vec3), pieces: Fragments, record: int, face: int) -> int:
-    """The fragment of a record that shows most on a face."""
-    stop = pieces.count
+def fragments_end(pieces: Fragments, record: int) -> int:
+    """One past a record's last entry in ``pieces.order``."""
     if record + 1 < pieces.records:
-        stop = pieces.record_start[record + 1]
+        return pieces.record_start[record + 1]
+    return pieces.count
+
+
+@wp.func
+def largest_fragment(
+    geo: Geometry, normals: wp.array(dtype=wp.vec3), pieces: Fragments, record: int, face: int, role: int
+) -> int:
+    """The fragment of a record, of one role or of ``ANY``, that shows most on a face; -1 for none."""
     chosen = int(-1)
-    most = float(-1.0)
-    for j in range(pieces.record_start[record], stop):
+    most = float(0.0)
+    for j in range(pieces.record_start[record], fragments_end(pieces, record)):
         fragment = pieces.order[j]
         triangle = pieces.triangle[fragment]
-        facing = face_weight(normals[triangle], face)
-        if geo.double_sided[triangle] != 0:
-            facing = wp.max(facing, face_weight(-normals[triangle], face))
-        if facing * pieces.place[fragment][3] > most:
-            most = facing * pieces.place[fragment][3]
-            chosen = fragment
+        if role == ANY or role == wp.where(triangle >= geo.synthetic_first, 1, 0):
+            facing = face_weight(normals[triangle], face)
+            if geo.double_sided[triangle] != 0:
+                facing = wp.max(facing, face_weight(-normals[triangle], face))
+            if facing * pieces.place[fragment][3] > most:
+                most = facing * pieces.place[fragment][3]
+                chosen = fragment
     return chosen
 
 
@@ -112,20 +123,198 @@ def fragment_normal(normals: wp.array(dtype=wp.vec3), triangle: int, face: int) 
 
 
 @wp.func
-def is_buried(
-    geo: Geometry, normals: wp.array(dtype=wp.vec3), position: wp.vec3, normal: wp.vec3, reach: float, near: float
-) -> bool:
-    """Whether a surface point lies in an object, or so close under one that it stands for little but itself."""
-    origin = position + normal * (OFFSET_RELATIVE * reach)
+def fragment_position(pieces: Fragments, fragment: int) -> wp.vec3:
+    place = pieces.place[fragment]
+    return wp.vec3(place[0], place[1], place[2])
+
+
+@wp.struct
+class Outlook:
+    """Where a piece of surface looks around from, and whether it lies in an object, or so close under one that it
+    stands for little but itself."""
+
+    eye: wp.vec3
+    buried: wp.int32
+
+
+@wp.func
+def outlook(
+    geo: Geometry,
+    normals: wp.array(dtype=wp.vec3),
+    pieces: Fragments,
+    fragment: int,
+    face: int,
+    near: float,
+    lift: float,
+) -> Outlook:
+    """What covers a piece within ``near`` buries it; its eye is ``lift`` above it, or half as high as what is there."""
+    result = Outlook()
+    position = fragment_position(pieces, fragment)
+    normal = fragment_normal(normals, pieces.triangle[fragment], face)
+    origin = position + normal * (OFFSET_RELATIVE * wp.max(largest_coordinate(position), 1.0))
     hit = trace_all(geo, origin, normal, FAR)
-    if hit.found == 0:
+    result.eye = origin + normal * wp.min(lift, 0.5 * hit.t)
+    if hit.found != 0:
+        from_behind = wp.dot(normals[hit.triangle], normal) > 0.0 and geo.double_sided[hit.triangle] == 0
+        if hit.t < near or from_behind:
+            result.buried = 1
+    return result
+
+
+@wp.func
+def sees(geo: Geometry, one: wp.vec3, other: wp.vec3) -> bool:
+    """Whether nothing is between two points."""
+    d = other - one
+    distance = wp.length(d)
+    if distance <= 0.0:
+        return True
+    direction = d / distance
+    if occluded_by_synthetic(geo, one, direction, distance):
         return False
-    from_behind = wp.dot(normals[hit.triangle], normal) > 0.0 and geo.double_sided[hit.triangle] == 0
-    return hit.t < near or from_behind
+    return not occluded_by_real(geo, one, direction, distance)
+
+
+@wp.func
+def put_sheet(sheets: Sheets, at: int, fragment: int, look: Outlook):
+    sheets.fragment[at] = fragment
+    sheets.eye[at] = look.eye
+    sheets.buried[at] = look.buried
 
 
 @wp.kernel
-def _choose_patches(
+def _mark_synthetic(
+    first: int,
+    geo: Geometry,
+    start_in: wp.array(dtype=wp.int32),
+    face_order_in: wp.array(dtype=wp.int32),
+    entries: int,
+    runs: int,
+    pieces: Fragments,
+    synthetic_out: wp.array(dtype=wp.int32),
+):
+    """Whether what shows on an occupied face, or shares a record with it, is synthetic."""
+    i = first + wp.tid()
+    end = entries
+    if i + 1 < runs:
+        end = start_in[i + 1]
+    found = int(0)
+    for j in range(start_in[i], end):
+        # Real fragments come first.
+        if pieces.triangle[pieces.order[fragments_end(pieces, face_order_in[j] / 6) - 1]] >= geo.synthetic_first:
+            found = 1
+    synthetic_out[i] = found
+
+
+@wp.func
+def part_sheets(
+    geo: Geometry,
+    normals: wp.array(dtype=wp.vec3),
+    face_order: wp.array(dtype=wp.int32),
+    start: int,
+    end: int,
+    pieces: Fragments,
+    near: float,
+    lift: float,
+    base: int,
+    sheets: Sheets,
+) -> int:
+    """Sheets beside the one at ``base``: of another role, or out of its sight. Returns how many there are then.
+
+    The largest piece of a sheet stands for it; buried ones only where nothing else of their role is behind the face.
+    """
+    face = face_order[start] % 6
+    count = int(1)
+    for role in range(2):
+        known_role = bool(False)
+        covered = int(-1)
+        for k in range(count):
+            if wp.where(pieces.triangle[sheets.fragment[base + k]] >= geo.synthetic_first, 1, 0) == role:
+                known_role = True
+        for j in range(start, end):
+            fragment = largest_fragment(geo, normals, pieces, face_order[j] / 6, face, role)
+            if fragment >= 0:
+                look = outlook(geo, normals, pieces, fragment, face, near, lift)
+                if look.buried != 0:
+                    covered = fragment
+                else:
+                    known = bool(False)
+                    for k in range(count):
+                        other = sheets.fragment[base + k]
+                        same = wp.where(pieces.triangle[other] >= geo.synthetic_first, 1, 0) == role
+                        if not known and same and sheets.buried[base + k] == 0:
+                            if sees(geo, look.eye, sheets.eye[base + k]):
+                                known = True
+                                if k > 0 and pieces.place[fragment][3] > pieces.place[other][3]:
+                                    put_sheet(sheets, base + k, fragment, look)
+                    if not known and count < MOST_SHEETS - 1 + role:
+                        put_sheet(sheets, base + count, fragment, look)
+                        count += 1
+                        known_role = True
+        if not known_role and covered >= 0:
+            put_sheet(sheets, base + count, covered, outlook(geo, normals, pieces, covered, face, near, lift))
+            count += 1
+    return count
+
+
+@wp.kernel
+def _find_sheets(
+    first: int,
+    geo: Geometry,
+    normal_in: wp.array(dtype=wp.vec3),
+    face_key_in: wp.array(dtype=wp.int32),
+    start_in: wp.array(dtype=wp.int32),
+    face_order_in: wp.array(dtype=wp.int32),
+    entries: int,
+    runs: int,
+    area_in: wp.array(dtype=wp.vec2),
+    pieces: Fragments,
+    near: float,
+    lift: float,
+    synthetic_in: wp.array(dtype=wp.int32),
+    sheets_out: Sheets,
+    count_out: wp.array(dtype=wp.int32),
+    holds_out: wp.array(dtype=wp.int32),
+):
+    """The largest fragment behind each occupied face that is not buried, and, in voxels that hold something synthetic,
+    one of each further sheet. ``holds_out`` is 1 for these voxels."""
+    i = first + wp.tid()
+    end = entries
+    if i + 1 < runs:
+        end = start_in[i + 1]
+    face = face_key_in[i] % 6
+    at = MOST_SHEETS * i
+    best = int(-1)
+    most = float(0.0)
+    for j in range(start_in[i], end):
+        area = area_in[face_order_in[j]][1]
+        if area > most:
+            fragment = largest_fragment(geo, normal_in, pieces, face_order_in[j] / 6, face, ANY)
+            look = outlook(geo, normal_in, pieces, fragment, face, near, lift)
+            if best < 0 or look.buried == 0:
+                best = fragment
+                put_sheet(sheets_out, at, fragment, look)
+            if look.buried == 0:
+                most = area
+    voxel = face_key_in[i] / 6
+    holds = int(0)
+    before = int(0)
+    for d in range(-5, 6):
+        k = i + d
+        if k >= 0 and k < runs:
+            if face_key_in[k] / 6 == voxel:
+                holds = wp.max(holds, synthetic_in[k])
+                if d < 0:
+                    before += 1
+    count = int(1)
+    if holds != 0:
+        count = part_sheets(geo, normal_in, face_order_in, start_in[i], end, pieces, near, lift, at, sheets_out)
+    count_out[i] = count
+    if before == 0:
+        holds_out[voxel] = holds
+
+
+@wp.kernel
+def _write_patches(
     first: int,
     geo: Geometry,
     mats: Materials,
@@ -139,60 +328,113 @@ def _choose_patches(
     area_in: wp.array(dtype=wp.vec2),
     faces: float,
     pieces: Fragments,
-    near: float,
-    patches_out: Patches,
+    sheets: Sheets,
+    count_in: wp.array(dtype=wp.int32),
+    end_in: wp.array(dtype=wp.int32),
+    patch_out: wp.array(dtype=Patch),
     table_out: wp.array(dtype=wp.int32),
 ):
-    """The largest fragment behind each occupied face that is not buried becomes its patch.
-
-    A face covers ``faces`` of level 0; what something covers within ``near`` counts as buried.
-    """
+    """The patches of one occupied face, which covers ``faces`` of level 0."""
     i = first + wp.tid()
     end = entries
     if i + 1 < runs:
         end = start_in[i + 1]
-    face = face_key_in[i] % 6
-    best = int(-1)
-    most = float(-1.0)
     shown = float(0.0)
     for j in range(start_in[i], end):
-        area = area_in[face_order_in[j]][1]
-        shown += area
-        if area > most:
-            fragment = largest_fragment(geo, normal_in, pieces, face_order_in[j] / 6, face)
-            triangle = pieces.triangle[fragment]
-            normal = fragment_normal(normal_in, triangle, face)
-            place = pieces.place[fragment]
-            position = wp.vec3(place[0], place[1], place[2])
-            reach = wp.max(largest_coordinate(position), 1.0)
-            buried = is_buried(geo, normal_in, position, normal, reach, near)
-            if best < 0 or not buried:
-                best = fragment
-            if not buried:
-                most = area
-    patches_out.area[i] = shown / faces
-    triangle = pieces.triangle[best]
-    normal = fragment_normal(normal_in, triangle, face)
-    place = pieces.place[best]
-    s = fragment_surface(geo, mats, triangle, wp.vec3(place[0], place[1], place[2]), -normal)
-    patches_out.position[i] = s.position
-    patches_out.normal[i] = normal
-    patches_out.albedo[i] = hemispherical_albedo(s)
-    patches_out.reach[i] = s.reach
-    patches_out.real[i] = 1 - s.synthetic
-    patches_out.place[i] = wp.int64(level_key_in[face_key_in[i] / 6]) * wp.int64(6) + wp.int64(face_key_in[i] % 6)
-    table_out[face_key_in[i]] = i
+        shown += area_in[face_order_in[j]][1]
+    face = face_key_in[i] % 6
+    at = end_in[i] - count_in[i]
+    table_out[face_key_in[i]] = at
+    for k in range(count_in[i]):
+        fragment = sheets.fragment[MOST_SHEETS * i + k]
+        triangle = pieces.triangle[fragment]
+        normal = fragment_normal(normal_in, triangle, face)
+        s = fragment_surface(geo, mats, triangle, fragment_position(pieces, fragment), -normal)
+        patch = Patch()
+        patch.position = s.position
+        patch.normal = normal
+        patch.albedo = hemispherical_albedo(s)
+        patch.eye = sheets.eye[MOST_SHEETS * i + k]
+        patch.reach = s.reach
+        patch.area = shown / faces
+        patch.real = 1 - s.synthetic
+        patch.buried = sheets.buried[MOST_SHEETS * i + k]
+        patch.next = wp.where(k + 1 < count_in[i], at + k + 1, -1)
+        patch.place = wp.int64(level_key_in[face_key_in[i] / 6]) * wp.int64(6) + wp.int64(face)
+        patch_out[at + k] = patch
+
+
+@wp.kernel
+def _mark_mixed(
+    first: int,
+    volume: Volume,
+    level: int,
+    level_first: int,
+    level_key_in: wp.array(dtype=wp.int32),
+    holds_in: wp.array(dtype=wp.int32),
+    mixed_out: wp.array(dtype=wp.int32),
+):
+    """Voxels that hold something synthetic, and those next to them."""
+    i = first + wp.tid()
+    cell = key_cell(level_key_in[i], brick_extent(volume.n, level))
+    mixed = int(0)
+    for k in range(NEIGHBOURS):
+        step = neighbour_step(k)
+        record = find_record(volume, level, cell[0] + step[0], cell[1] + step[1], cell[2] + step[2])
+        if record >= 0:
+            mixed = wp.max(mixed, holds_in[record - level_first])
+    mixed_out[i] = mixed
+
+
+@wp.kernel
+def _find_neighbours(
+    first: int,
+    geo: Geometry,
+    volume: Volume,
+    level: int,
+    level_first: int,
+    patches: wp.array(dtype=Patch),
+    table_in: wp.array(dtype=wp.int32),
+    mixed_in: wp.array(dtype=wp.int32),
+    beside_out: wp.array(dtype=wp.int32),
+):
+    """For each patch of a mixed voxel and each voxel around: the patch behind the same face there that it sees, of its
+    own role where there is one; or -1."""
+    i = first + wp.tid()
+    cell = key_cell(int(patches[i].place / wp.int64(6)), brick_extent(volume.n, level))
+    face = int(patches[i].place % wp.int64(6))
+    mixed = mixed_in[find_record(volume, level, cell[0], cell[1], cell[2]) - level_first]
+    for k in range(NEIGHBOURS):
+        best = int(-1)
+        if mixed != 0:
+            step = neighbour_step(k)
+            record = find_record(volume, level, cell[0] + step[0], cell[1] + step[1], cell[2] + step[2])
+            patch = int(-1)
+            if record >= 0:
+                patch = table_in[6 * (record - level_first) + face]
+            while patch >= 0:
+                better = bool(best < 0)
+                if not better:
+                    better = patches[patch].real == patches[i].real and patches[best].real != patches[i].real
+                if better and sees(geo, patches[i].eye, patches[patch].eye):
+                    best = patch
+                patch = patches[patch].next
+            if step[0] == 0 and step[1] == 0 and step[2] == 0:
+                best = i
+        beside_out[NEIGHBOURS * i + k] = best
 
 
 @wp.func
-def backs(patches: Patches, table: wp.array(dtype=wp.int32), front: int, place: int, thickness: float) -> bool:
+def backs(
+    patches: wp.array(dtype=Patch), table: wp.array(dtype=wp.int32), front: int, place: int, thickness: float
+) -> bool:
     """Whether the patch at ``place`` of the table is the other side of the wall that ``front`` belongs to, no farther
     behind it than ``thickness``."""
     back = table[place]
-    if back < 0 or patches.area[back] < WALL_AREA:
+    if back < 0 or patches[back].area < WALL_AREA:
         return False
-    behind = wp.dot(patches.position[front] - patches.position[back], patches.normal[front])
-    return behind >= 0.0 and behind <= thickness and wp.dot(patches.normal[back], patches.normal[front]) < OPPOSITE
+    behind = wp.dot(patches[front].position - patches[back].position, patches[front].normal)
+    return behind >= 0.0 and behind <= thickness and wp.dot(patches[back].normal, patches[front].normal) < OPPOSITE
 
 
 @wp.kernel
@@ -202,7 +444,7 @@ def _find_walls(
     level: int,
     level_first: int,
     level_key_in: wp.array(dtype=wp.int32),
-    patches: Patches,
+    patches: wp.array(dtype=Patch),
     table_in: wp.array(dtype=wp.int32),
     wall_out: wp.array(dtype=wp.vec4),
     found_out: wp.array(dtype=wp.int32),
@@ -217,29 +459,29 @@ def _find_walls(
     most = float(WALL_AREA)
     for face in range(6):
         front = table_in[6 * i + face]
-        if front >= 0 and patches.area[front] > most:
+        if front >= 0 and patches[front].area > most:
             opposite = face ^ 1
             step = wp.vec3i(0, 0, 0)
             step[face / 2] = wp.where((face & 1) == 0, -1, 1)
             next = find_record(volume, level, cell[0] + step[0], cell[1] + step[1], cell[2] + step[2]) - level_first
-            offset = wp.dot(patches.normal[front], patches.position[front])
+            offset = wp.dot(patches[front].normal, patches[front].position)
             found = False
             if backs(patches, table_in, front, 6 * i + opposite, thickness):
                 # Both sides are in this voxel: the middle is between them.
                 back = table_in[6 * i + opposite]
-                offset = 0.5 * (offset + wp.dot(patches.normal[front], patches.position[back]))
+                offset = 0.5 * (offset + wp.dot(patches[front].normal, patches[back].position))
                 found = True
             elif next >= 0:
                 found = backs(patches, table_in, front, 6 * next + opposite, thickness)
             if found:
-                most = patches.area[front] * CLEARLY
-                n = patches.normal[front]
+                most = patches[front].area * CLEARLY
+                n = patches[front].normal
                 wall_out[i] = wp.vec4(n[0], n[1], n[2], offset)
                 found_out[i] = 1
 
 
 @wp.kernel
-def _wall_of_patches(first: int, patches: Patches, field: BounceField, wall_out: wp.array(dtype=wp.vec4)):
+def _wall_of_patches(first: int, field: BounceField, patch_out: wp.array(dtype=Patch)):
     """The thin wall beside each patch."""
     i = first + wp.tid()
-    wall_out[i] = wall_beside(field, off_surface(field, patches.position[i], patches.normal[i]))
+    patch_out[i].wall = wall_beside(field, off_surface(field, patch_out[i].position, patch_out[i].normal))

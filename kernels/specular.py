@@ -107,7 +107,7 @@ def shade_hit(
     """Radiance that a surface met by a reflected ray sends back: direct light by shadow rays, further bounces from the
     patches, and its own reflection by one more ray."""
     result = lit_by_lights(geo, lights, s, wo, glossy, with_before, index, sample)
-    bounced = bounced_irradiance(bounces, s.position, s.normal_g)
+    bounced = bounced_irradiance(bounces, s.position, s.normal_g, s.synthetic)
     reflectance = diffuse_reflectance(s, wo, glossy.alpha_max)
     result.before += wp.cw_mul(reflectance, bounced.before)
     result.after += wp.cw_mul(reflectance, bounced.after)

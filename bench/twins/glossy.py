@@ -16,8 +16,8 @@ from warp_dvct.bench.twins.stage import POINT, make_scene
 from warp_dvct.bench.twins.surfaces import Surfaces, brdf_cos, specular_albedo
 from warp_dvct.bench.twins.volumes import fields, lit
 from warp_dvct.kernels import gather
-from warp_dvct.passes.bounces import bounce_field
 from warp_dvct.passes.gather import Gatherer, glossy_hits
+from warp_dvct.passes.patches import bounce_field
 from warp_dvct.scene import Material
 
 MATERIALS = (

@@ -13,9 +13,9 @@ from warp_dvct.bench.twins.numbers import cosine_hemisphere, dot, from_frame, ha
 from warp_dvct.bench.twins.stage import Twin
 from warp_dvct.bench.twins.volumes import N, fields, lit
 from warp_dvct.kernels import bounces, cones, gather, reconstruction, specular
+from warp_dvct.kernels.bounce_field import Patch
 from warp_dvct.kernels.environment import Environment
 from warp_dvct.kernels.gbuffer import Points
-from warp_dvct.kernels.patches import Patches
 from warp_dvct.kernels.radiosity import World
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.gather import Gatherer
@@ -236,9 +236,9 @@ def measure_bounces(launcher: Any) -> list[Deviation]:
     link = rng.integers(-1, count, (count, RAYS, 2)).astype(np.int32)
     albedo, irradiance = rng.uniform(0, 1, (count, 3)), rng.uniform(0, 9, (count, 2, 3))
     real = rng.integers(0, 2, count).astype(np.int32)
-    patches = Patches()
-    patches.albedo = launcher.array(albedo.astype(np.float32), wp.vec3)
-    patches.real = launcher.array(real, wp.int32)
+    values = np.zeros(count, Patch.numpy_dtype())
+    values["albedo"], values["real"] = albedo, real
+    patches = launcher.array(values, Patch)
     last = launcher.array(irradiance.reshape(-1, 3).astype(np.float32), wp.vec3)
     following, total = (launcher.zeros(2 * count, wp.vec3) for _ in range(2))
     links = launcher.array(link.reshape(-1, 2), wp.vec2i)

@@ -92,7 +92,7 @@ def face_areas(twin: Twin) -> np.ndarray:
 
 
 def mean_albedos(twin: Twin) -> np.ndarray:
-    """Of the surfaces in each voxel, weighted by area, before and after: ``[x, y, z, 2, 3]``."""
+    """Of the real and the synthetic surfaces in each voxel, weighted by area: ``[x, y, z, 2, 3]``."""
     each = []
     for material in MATERIALS:
         f0 = np.full((1, 3), ((material.ior - 1.0) / (material.ior + 1.0)) ** 2)
@@ -106,9 +106,9 @@ def mean_albedos(twin: Twin) -> np.ndarray:
         for cell in np.ndindex(*(np.minimum(high, N - 1) - low + 1)):
             at = tuple(low + cell)
             part = clipped_area(triangle, np.array(at, float))
-            solutions = slice(1, 2) if i >= twin.reals else slice(0, 2)
-            total[at][solutions] += part * each[twin.device.material[i]]
-            area[at][solutions] += part
+            role = int(i >= twin.reals)
+            total[at][role] += part * each[twin.device.material[i]]
+            area[at][role] += part
     return np.where(area > 1e-6, total / np.where(area > 1e-6, area, 1.0), 0.0)
 
 
@@ -119,7 +119,7 @@ def measure_albedos(launcher: Any) -> list[Deviation]:
     got = mean_albedo(launcher, twin.device, voxels, twin.device_normals(launcher)).numpy()
     grid = dense(voxels, got[: 2 * voxels.level_records[0]].reshape(-1, 2, 3))
     expected = mean_albedos(twin)
-    solid = (expected[..., 1, 0] > 0.0) & (grid[..., 1, 0] > 0.0)
+    solid = (expected[..., 0].sum(-1) > 0.0) & (grid[..., 0].sum(-1) > 0.0)
     return [compare(bounces._mean_albedo, "albedo", grid[solid].reshape(-1, 6), expected[solid].reshape(-1, 6))]
 
 

@@ -10,7 +10,7 @@ import pytest
 from extreme_scenes import ball, numbers, room
 
 from warp_dvct.enclosure import cut_to, winding_number, within_enclosure
-from warp_dvct.scene import Role
+from warp_dvct.scene import Light, LightKind, LightRole, Role
 
 SHELF_INSIDE = 0.39999
 
@@ -90,3 +90,42 @@ def test_what_is_not_closed_is_left_as_it_is():
     assert within_enclosure(inside) is inside
     beyond = room(shelf(10.0), lit.mesh(lit.ball((5, 5, 5), 0.5, 6), Role.SYNTHETIC))
     assert len(within_enclosure(beyond).meshes) == 2
+
+
+OVER_THE_FLOOR, IN_THE_AIR = (0.5, 0.202, 0.42), (0.5, 0.32, 0.42)
+
+
+def lantern(walls: str, center: tuple[float, float, float], half: float = 0.1, thickness: float = 0.01):
+    """A closed synthetic box or ball around ``center``: of one sheet, or of an outer and an inner one."""
+    if walls == "ball":
+        return lit.mesh(lit.ball(center, half, 10), Role.SYNTHETIC, 0)
+    sheets = [lit.cuboid(center, half)]
+    if walls == "thick":
+        sheets.append(lit.cuboid(center, half - thickness)[:, ::-1])
+    return lit.mesh(np.concatenate(sheets), Role.SYNTHETIC, 0)
+
+
+@pytest.mark.parametrize(
+    ("walls", "center", "patches", "most"),
+    [
+        ("sheet", IN_THE_AIR, 256, 1e-4),
+        ("thick", IN_THE_AIR, 256, 1e-4),
+        ("ball", IN_THE_AIR, 256, 0.005),
+        ("sheet", OVER_THE_FLOOR, 256, 0.02),
+        ("thick", OVER_THE_FLOOR, 256, 0.01),
+        ("sheet", OVER_THE_FLOOR, 4096, 0.01),
+        ("ball", OVER_THE_FLOOR, 4096, 0.015),
+    ],
+)
+def test_a_lamp_in_a_closed_object_lights_nothing_else(walls, center, patches, most):
+    """Eight bounces, over the light that it sends into the room without the object. 256 patches are as large as the
+    object. What is left at the floor is in voxels that hold it and the object's lining, which face the same way."""
+    lamp_inside = Light(LightKind.POINT, (1.0, 1.0, 1.0), position=center, role=LightRole.ADDED)
+    far = lit.mesh(lit.ball((0.2, 0.2, 0.3), 0.03, 4), Role.SYNTHETIC, 0)
+    fine = {"volume__resolution": 96, "volume__coarse": 64, "rsm__texels": 256} if patches > 256 else {}
+    settings = {"bounces": 8, "patches__count": patches, **fine}
+    closed, free = (
+        numbers(room(*objects, lights=(lamp_inside,)), "rays", **settings).picture.mean()
+        for objects in ((lantern(walls, center), far), (far,))
+    )
+    assert closed < most * free

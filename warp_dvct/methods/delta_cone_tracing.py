@@ -22,7 +22,7 @@ from warp_dvct.kernels import cones, radiosity, shading, specular
 from warp_dvct.kernels.volume import Volume
 from warp_dvct.launch import Launcher
 from warp_dvct.layers import Radiance
-from warp_dvct.passes.bounces import bounce_field, choose_patches, mean_albedo, reinject, solve_bounces
+from warp_dvct.passes.bounces import mean_albedo, reinject, solve_bounces
 from warp_dvct.passes.environment import build_environment
 from warp_dvct.passes.gather import (
     Gatherer,
@@ -34,6 +34,7 @@ from warp_dvct.passes.gather import (
 )
 from warp_dvct.passes.gbuffer import GBuffer, render_gbuffer, see_real
 from warp_dvct.passes.injection import empty_flux, inject
+from warp_dvct.passes.patches import bounce_field, choose_patches
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
 from warp_dvct.passes.resolve import resolve
 from warp_dvct.passes.rsm import render_real, render_rsm
@@ -290,12 +291,11 @@ def _bounce(
         seed=settings.seed,
         kept=kept,
     )
-    field = bounce_field(launcher, patches, total)
     for voxels, flux in zip(volumes, fluxes, strict=True):
         albedo = mean_albedo(launcher, scene, voxels, normals)
-        reinject(launcher, voxels, albedo, flux, field)
+        reinject(launcher, scene, normals, voxels, albedo, flux, patches, total)
         light_faces(launcher, voxels, flux, filter=settings.cones_filter)
-    return field
+    return bounce_field(launcher, patches, total)
 
 
 def _has_indirect(scene: Scene, plan: Plan) -> bool:
