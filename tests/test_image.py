@@ -175,7 +175,7 @@ def test_missing_and_corrupt_plates_are_named(tmp_path):
     with pytest.raises(FileError, match="does not exist or is not a file"):
         read_plate(tmp_path)
     (tmp_path / "text.png").write_text("not an image")
-    with pytest.raises(FileError, match=r"text\.png' cannot be read"):
+    with pytest.raises(FileError, match=r"text\.png' cannot be read: Could not open file: Not a PNG file; is it an"):
         read_plate(tmp_path / "text.png")
 
 

@@ -167,7 +167,7 @@ def read_plate(path: str | Path, width: int | None = None, height: int | None = 
     hints.attribute("oiio:UnassociatedAlpha", 1)
     image = oiio.ImageBuf(name, 0, 0, hints)
     if not image.read(0, 0, True):
-        raise FileError(f"plate '{name}' cannot be read: {image.geterror() or oiio.geterror()}; is it an image?")
+        raise FileError(f"plate '{name}' cannot be read: {_once(image.geterror())}; is it an image?")
     native = image.nativespec()
     is_float = native.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
     image = oiio.ImageBufAlgo.reorient(image)
@@ -179,6 +179,11 @@ def read_plate(path: str | Path, width: int | None = None, height: int | None = 
             " a plate is not resampled: give --imageWidth and a camera that match it, or another plate"
         )
     return pixels if is_float else srgb_to_linear(pixels)
+
+
+def _once(message: str) -> str:
+    """OpenImageIO's error with each of its lines once; it tries to open twice, and says so."""
+    return "; ".join(dict.fromkeys(line.strip() for line in message.splitlines() if line.strip()))
 
 
 def is_display_referred(path: str | Path) -> bool:
