@@ -68,7 +68,7 @@ def test_rays_take_what_is_left_of_the_time(surveys, monkeypatch, stage, budget,
         later = sum(price({n: work[n]}, pace.units) for n in LATER if n in work)
         return 0.35 * budget + slowness * (later + 0.8 * price({"gather": work["gather"]}, pace.units))
 
-    assert total(made) <= 0.95 * budget < total(with_rays(made, made.gather_rays + 1))
+    assert total(made) <= budget < total(with_rays(made, made.gather_rays + 1))
 
 
 def test_settled_rays_have_bounds(surveys, monkeypatch):
@@ -116,13 +116,17 @@ def test_a_settled_frame_is_that_of_its_settings(monkeypatch, tmp_path):
 
 
 def test_trials_are_spread_over_the_picture():
-    """Points of each trial lie evenly, and are not those of another."""
-    from warp_dvct.pace import TRIALS, _spread
+    """Runs of neighbours lie evenly, and are not those of another trial."""
+    from warp_dvct.pace import RUN, TRIALS, _spread
 
-    pixels = np.arange(0, 5000, 2)
-    trials = [_spread(pixels, 50, k) for k in range(TRIALS)]
+    pixels = np.arange(0, 10_000, 2)
+    trials = [_spread(pixels, 5 * RUN, k) for k in range(TRIALS)]
     for points in trials:
-        np.testing.assert_allclose(np.diff(points), 100, atol=2)
-    assert len(np.unique(np.concatenate(trials))) == 50 * TRIALS
+        runs = points.reshape(5, RUN)
+        assert (np.diff(runs, axis=1) == 2).all()
+        np.testing.assert_allclose(np.diff(runs[:, 0]), 2000, atol=2)
+    assert len(np.unique(np.concatenate(trials))) == 5 * RUN * TRIALS
+    assert len(_spread(pixels, RUN + 1, 0)) == 2 * RUN
+    assert len(np.unique(_spread(pixels[:RUN], 1000, TRIALS - 1))) == RUN
     assert len(_spread(pixels[:3], 50, 0)) == 3
     assert len(_spread(pixels[:0], 50, 0)) == 0

@@ -21,7 +21,7 @@ from warp_dvct.passes.gather import FINEST
 from warp_dvct.settings import NAMES, Settings, make_settings
 from warp_dvct.survey import Survey
 
-AIM = 0.95  # of the budget: the model's own spread is then inside of it
+AIM = 0.95  # of the budget, for the settings' prediction; what is left when rays are settled goes into them
 VOXELS_PER_FEATURE = 2.0  # across the smallest extent of an object, for its light not to pass through it
 NEARLY = 0.9  # of what is aimed at: a choice that takes less has nothing more to gain
 SHOWS = 0.005  # of an error: what doubling the rays has to take off it to be worth their time
@@ -207,7 +207,7 @@ class _Chooser:
         if budget is not None:
             state, enough = self._fill(state, aim)
             stopped = "more would not show" if enough else "the time is used up"
-            pace = self._pace(state, aim, enough=enough)
+            pace = self._pace(state, budget, enough=enough)
         return replace(self._choice(state, floor, stopped, enough=enough), pace=pace)
 
     def _pace(self, state: Mapping[str, float], aim: float, *, enough: bool) -> Pace | None:
