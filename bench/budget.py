@@ -26,7 +26,7 @@ ERROR_FACTOR = 1.5  # between predicted and measured error
 @dataclass(frozen=True)
 class BudgetOptions:
     """What is measured; the fields are the command's flags. ``samples`` are of the truth; 0 measures no error. Of
-    ``repeats`` the least times count: on a busy machine they are nearer to what the frame takes."""
+    ``repeats`` the one with the median time counts."""
 
     budgets: tuple[float, ...] = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
     width: int = 320
@@ -73,12 +73,12 @@ def measure(
             rows.append({**row, "budget": budget, "refused": str(error)})
             report(rows[-1])
             continue
-        best = min(tries, key=lambda t: t["cpu_seconds"])
-        comp = best.pop("comp")
+        middle = sorted(tries, key=lambda t: t["seconds"])[len(tries) // 2]
+        comp = middle.pop("comp")
         flip = None
         if truth is not None:
             flip = math.sqrt(max(flip_ldr(truth.comp, comp)[0] ** 2 - truth.noise**2, 0.0))
-        rows.append({**row, "budget": budget, **best, "seconds": min(t["seconds"] for t in tries), "flip": flip})
+        rows.append({**row, "budget": budget, **middle, "flip": flip})
         report(rows[-1])
     return rows
 
@@ -94,7 +94,7 @@ def _keep(scene: Any, budget: float, plate: np.ndarray, options: BudgetOptions, 
     comp = relighter.render(plate).comp
     stats = relighter.stats
     return {
-        "predicted": choice.to_dict(),
+        "predicted": choice.to_dict(),  # with what was settled during the frame
         "seconds": planning + stats["render_seconds"],
         "cpu_seconds": planning_cpu + stats["cpu_seconds"],
         "passes": stats["passes"],
@@ -104,22 +104,25 @@ def _keep(scene: Any, budget: float, plate: np.ndarray, options: BudgetOptions, 
 
 
 HEAD = (
-    f"{'':17}{'budget':>8}{'predicted':>11}{'actual':>8}{'ratio':>7}{'CPU s pred.':>13}{'actual':>8}{'ratio':>7}"
-    f"{'FLIP pred.':>12}{'actual':>8}{'ratio':>7}"
+    f"{'':17}{'budget':>8}{'predicted':>11}{'actual':>8}{'ratio':>7}{'CPU s':>8}{'rays planned':>14}{'settled':>9}"
+    f"{'slowness':>10}{'FLIP pred.':>12}{'actual':>8}{'ratio':>7}"
 )
 
 
 def format_row(row: dict[str, Any]) -> str:
-    """A line under :data:`HEAD`; ratios are actual time over budget, actual over predicted processor time, and actual
-    over predicted error."""
+    """A line under :data:`HEAD`; ratios are actual time over budget and actual over predicted error, ``slowness`` is
+    what the frame had taken over its prediction when the rays were settled."""
     if "refused" in row:
         return f"{row['stage']:17}{row['budget']:8.2f}  {row['refused']}"
-    predicted, flip = row["predicted"], row["flip"]
+    predicted, flip, settled = row["predicted"], row["flip"], row["predicted"].get("settled")
     line = (
         f"{row['stage']:17}{row['budget']:8.2f}{predicted['seconds']:11.2f}{row['seconds']:8.2f}"
-        f"{row['seconds'] / row['budget']:7.2f}{predicted['cpu_seconds']:13.2f}{row['cpu_seconds']:8.2f}"
-        f"{row['cpu_seconds'] / predicted['cpu_seconds']:7.2f}"
+        f"{row['seconds'] / row['budget']:7.2f}{row['cpu_seconds']:8.2f}"
     )
+    if settled is not None:
+        line += f"{settled['planned']:14}{settled['rays']:9}{settled['slowness']:10.2f}"
+    else:
+        line += f"{'-':>14}{'-':>9}{'-':>10}"
     if flip is not None and predicted["error"] is not None:
         ratio = f"{flip / predicted['error']:7.2f}" if predicted["error"] > 0 else f"{'-':>7}"
         line += f"{predicted['error']:12.4f}{flip:8.4f}{ratio}"
@@ -127,13 +130,12 @@ def format_row(row: dict[str, Any]) -> str:
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> str:
-    """How many budgets were kept, by the clock and by processor time, and how many errors were predicted."""
+    """How many budgets were kept by the clock, how fast the machine was, and how many errors were predicted."""
     kept = [r for r in rows if "refused" not in r]
     if not kept:
         return "every budget was below the floor"
     full = [r for r in kept if not r["predicted"].get("enough")]
     clock = [r["seconds"] / r["budget"] for r in full]
-    cpu = [r["cpu_seconds"] / r["predicted"]["cpu_seconds"] for r in kept]
     lines = []
     if full:
         lines.append(
@@ -146,10 +148,12 @@ def summarise(rows: Sequence[dict[str, Any]]) -> str:
             f"in {len(kept) - len(full)} more it was said that more time would not show; they took {most:.2f} of theirs"
             " at most"
         )
-    lines += [
-        f"processor time was within {NEAR:.0%} of the prediction for {_share(cpu, 1 - NEAR, LATEST)}; from"
-        f" {min(cpu):.2f} to {max(cpu):.2f} of it",
-    ]
+    slowness = [r["predicted"]["settled"]["slowness"] for r in kept if r["predicted"].get("settled")]
+    if slowness:
+        lines.append(
+            f"the frames' first passes took from {min(slowness):.2f} to {max(slowness):.2f} of their prediction, by"
+            " which rays were settled"
+        )
     errors = [r["flip"] / r["predicted"]["error"] for r in kept if r["flip"] and r["predicted"]["error"]]
     if errors:
         near = _share(errors, 1 / ERROR_FACTOR, ERROR_FACTOR)

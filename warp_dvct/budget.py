@@ -56,7 +56,10 @@ class Choice:
         """Some lines for a terminal."""
         error = "its noise is not predicted" if math.isnan(self.error) else f"FLIP {self.error:.4f}"
         head = f"predicted: {self.seconds:.2f} s ({self.cpu_seconds:.2f} s of processor time), {error}"
-        return "\n".join([head, *(f"  {line}" for line in self.reasons)])
+        lines = [head, *(f"  {line}" for line in self.reasons)]
+        if self.pace is not None:
+            lines.append("  gather.rays is settled once the volumes are lit, by the time that is left then")
+        return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """For statistics."""

@@ -20,7 +20,8 @@ from warp_dvct.settings import make_settings
 
 def row(seconds: float, flip: float | None = 0.03) -> dict:
     """A budget of 2 s, predicted to take 1.9 s and to err by 0.03."""
-    predicted = {"seconds": 1.9, "cpu_seconds": 3.0, "error": 0.03}
+    settled = {"rays": 40, "planned": 64, "slowness": 0.5 * seconds, "ray_slowness": 1.0}
+    predicted = {"seconds": 1.9, "cpu_seconds": 3.0, "error": 0.03, "settled": settled}
     return {
         "stage": "s",
         "budget": 2.0,
@@ -34,8 +35,20 @@ def row(seconds: float, flip: float | None = 0.03) -> dict:
 def test_a_summary_counts_what_was_kept():
     text = module.summarise([row(2.0), row(1.4), row(2.6, 0.05), row(2.4, None), {"refused": "floor"}])
     assert "of 4 budgets, 2 were kept within 25% by the clock, and the latest took 1.30" in text
+    assert "took from 0.70 to 1.30 of their prediction" in text
     assert "of 3 errors, 2 were predicted within a factor of 1.5" in text
     assert module.summarise([{"refused": "floor"}]) == "every budget was below the floor"
+
+
+def test_a_line_says_what_was_planned_and_settled():
+    head, line = module.HEAD.split(), module.format_row(row(2.2)).split()
+    assert line[:6] == ["s", "2.00", "1.90", "2.20", "1.10", "3.30"]
+    assert line[6:] == ["64", "40", "1.10", "0.0300", "0.0300", "1.00"]
+    assert head.index("settled") > head.index("planned")
+    unsettled = row(2.2)
+    unsettled["predicted"] |= {"settled": None, "enough": True}
+    assert module.format_row(unsettled).endswith("more would not show")
+    assert "floor" in module.format_row({"stage": "s", "budget": 1.0, "refused": "below the floor"})
 
 
 def test_a_tiny_room_keeps_a_budget(tmp_path, monkeypatch):
@@ -51,6 +64,7 @@ def test_a_tiny_room_keeps_a_budget(tmp_path, monkeypatch):
     assert 0.5 < kept["predicted"]["seconds"] <= 1.0
     assert 0 < kept["flip"] < 0.5
     assert kept["cpu_seconds"] > 0
+    assert kept["predicted"]["settled"]["rays"] == kept["predicted"]["chosen"]["gather.rays"]
     assert "of 1 budgets" in result.output
 
 
