@@ -173,6 +173,11 @@ def read_plate(path: str | Path, width: int | None = None, height: int | None = 
     image = oiio.ImageBufAlgo.reorient(image)
     pixels = _display_window(_rgb(image), image.spec())
     rows, columns = pixels.shape[:2]
+    if height is None and width not in (None, columns):
+        raise FileError(
+            f"plate '{name}' is {columns} x {rows} pixels and --imageWidth {width}; a plate is not resampled: leave"
+            " --imageWidth out, it decides the size"
+        )
     if (width or columns, height or rows) != (columns, rows):
         raise FileError(
             f"plate '{name}' is {columns} x {rows} pixels but the picture is {width or columns} x {height or rows};"

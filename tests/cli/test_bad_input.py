@@ -59,7 +59,7 @@ def test_plates_that_do_not_fit(command, room, out):
     write_png(out / "square.png", np.zeros((32, 32, 3), np.uint8))
     plate = ("--plate", out / "square.png")
     refuse(command("relight", room, out / "a.exr", *plate), 1, "square.png", "32 x 32", "32 x 18", "/World/Camera")
-    refuse(command("relight", room, out / "a.exr", *plate, "-w", 64), 1, "square.png", "32 x 32", "64 x 32")
+    refuse(command("relight", room, out / "a.exr", *plate, "-w", 64), 1, "square.png", "32 x 32", "--imageWidth 64")
     refuse(command("relight", room, out / "a.exr", "--plate", out / "none.png"), 1, "none.png")
     assert [file.name for file in out.iterdir()] == ["square.png"]
 

@@ -153,6 +153,14 @@ def test_a_stage_without_one_of_the_roles_says_how_to_tag(build):
         read_stage(build.stage)
 
 
+def test_a_capture_without_a_mesh_says_where_its_real_scene_comes_from(build):
+    thing(build)
+    build.stage.RemovePrim("/World/Room")
+    build.stage.GetPrimAtPath("/World/Camera").CreateAttribute("dvct:depth:file", Sdf.ValueTypeNames.Asset)
+    with pytest.raises(StageError, match=r"no geometry is real; the stage is a capture: give it as --real-from too"):
+        read_stage(build.stage)
+
+
 def test_invisible_synthetic_prims_are_an_empty_set_and_no_error(build):
     prim = thing(build)
     visibility = UsdGeom.Imageable(prim).CreateVisibilityAttr()

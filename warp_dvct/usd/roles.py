@@ -21,6 +21,12 @@ HOW_TO_TAG = (
     " the matte collection of a UsdRenderPass and a collection dvct:real on the default prim also mark real prims"
 )
 
+DEPTH_FILE = "dvct:depth:file"  # of a depth camera: its stage is a capture
+FROM_CAPTURE = (
+    "the stage is a capture: give it as --real-from too, which takes the real scene from its depth images, or make a"
+    " mesh of them by `warp-dvct reconstruct`"
+)
+
 
 @dataclass(frozen=True)
 class Tags:
@@ -181,4 +187,6 @@ def require_roles(stage: Usd.Stage, defined: set[Role]) -> None:
     for role in (Role.REAL, Role.SYNTHETIC):
         if role not in defined:
             word = role.name.lower()
-            raise StageError(f"{name_of(stage)}: no geometry is {word}; {HOW_TO_TAG.format(role=word)}")
+            live = role == Role.REAL and any(p.GetAttribute(DEPTH_FILE) for p in stage.Traverse())
+            how = FROM_CAPTURE if live else HOW_TO_TAG.format(role=word)
+            raise StageError(f"{name_of(stage)}: no geometry is {word}; {how}")
