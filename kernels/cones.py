@@ -34,8 +34,12 @@ class ConeResult:
 
 
 @wp.func
-def sample_volume(volume: Volume, level: int, position: wp.vec3, direction: wp.vec3) -> ConeResult:
-    """Trilinear sample of the faces that a ray along ``direction`` sees, weighted by its direction cosines."""
+def sample_volume(volume: Volume, level: int, position: wp.vec3, direction: wp.vec3, plane: wp.vec4) -> ConeResult:
+    """Trilinear sample of the faces that a ray along ``direction`` sees, weighted by its direction cosines.
+
+    ``plane`` (normal and offset) is the cone's own surface, or 0. In voxels that it cuts, and below it, faces that look
+    down at it are the surface's own lining, which interpolation would spread over to the cone's side.
+    """
     size = volume.voxel * float(1 << level)
     local = (position - volume.low) / size - wp.vec3(0.5, 0.5, 0.5)
     x0 = int(wp.floor(local[0]))
@@ -53,6 +57,10 @@ def sample_volume(volume: Volume, level: int, position: wp.vec3, direction: wp.v
     result = ConeResult()
     result.before = wp.vec4(0.0, 0.0, 0.0, 0.0)
     result.after = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    # Heights above the plane, in voxels, of the corners' centres; half of the spread is what a voxel reaches down.
+    spread = wp.abs(plane[0]) + wp.abs(plane[1]) + wp.abs(plane[2])
+    height = (plane[0] * position[0] + plane[1] * position[1] + plane[2] * position[2] - plane[3]) / size
+    near = height < 1.5 * spread
     for corner in range(8):
         dx = corner & 1
         dy = (corner >> 1) & 1
@@ -60,14 +68,23 @@ def sample_volume(volume: Volume, level: int, position: wp.vec3, direction: wp.v
         record = find_record(volume, level, x0 + dx, y0 + dy, z0 + dz)
         if record >= 0:
             weight = wp.where(dx == 1, fx, 1.0 - fx) * wp.where(dy == 1, fy, 1.0 - fy) * wp.where(dz == 1, fz, 1.0 - fz)
+            share = wp.vec3(wx, wy, wz)
+            if near:
+                above = height + plane[0] * (float(dx) - fx) + plane[1] * (float(dy) - fy) + plane[2] * (float(dz) - fz)
+                if above < 0.5 * spread:
+                    for axis in range(3):
+                        if direction[axis] * plane[axis] > 0.0:
+                            share[axis] = 0.0
             at = record * 12
             result.before += weight * (
-                wx * volume.field[at + face_x] + wy * volume.field[at + face_y] + wz * volume.field[at + face_z]
+                share[0] * volume.field[at + face_x]
+                + share[1] * volume.field[at + face_y]
+                + share[2] * volume.field[at + face_z]
             )
             result.after += weight * (
-                wx * volume.field[at + face_x + 1]
-                + wy * volume.field[at + face_y + 1]
-                + wz * volume.field[at + face_z + 1]
+                share[0] * volume.field[at + face_x + 1]
+                + share[1] * volume.field[at + face_y + 1]
+                + share[2] * volume.field[at + face_z + 1]
             )
     return result
 
@@ -111,12 +128,19 @@ def level_voxel(volume: Volume, level: int) -> float:
 
 @wp.func
 def march_cone(
-    fine: Volume, coarse: Volume, has_coarse: int, origin: wp.vec3, direction: wp.vec3, cone: ConeSettings
+    fine: Volume,
+    coarse: Volume,
+    has_coarse: int,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    plane: wp.vec4,
+    cone: ConeSettings,
 ) -> ConeResult:
     """Franke 2014, section 3.3, eqs. 3 and 4, for both solutions at once: ``before`` sees real surfaces alone.
 
     The march goes through the fine volume and, beyond its border, through the coarse one. With ``cone.split`` the
-    result's ``before`` is the delta field under the single occupancy of all surfaces.
+    result's ``before`` is the delta field under the single occupancy of all surfaces. ``plane`` is as in
+    ``sample_volume``.
     """
     total = ConeResult()
     total.before = wp.vec4(0.0, 0.0, 0.0, 0.0)
@@ -133,12 +157,12 @@ def march_cone(
         middle = position + direction * (0.5 * step)
         value = ConeResult()
         if inside_box(fine, middle, wp.where(has_coarse != 0, 0.0, level_voxel(fine, level))):
-            value = sample_volume(fine, level, middle, direction)
+            value = sample_volume(fine, level, middle, direction, plane)
         elif has_coarse != 0:
             level = level_of(coarse, width)
             step = cone.step * level_voxel(coarse, level)
             middle = position + direction * (0.5 * step)
-            value = sample_volume(coarse, level, middle, direction)
+            value = sample_volume(coarse, level, middle, direction, plane)
             # A wall on the border fades over one voxel to each side of it.
             searching = inside_box(coarse, middle, level_voxel(coarse, level))
         else:

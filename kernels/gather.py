@@ -98,7 +98,12 @@ def cone_incident(
     alone; ``before`` is then 0 unless ``with_before`` asks for it by a second march.
     """
     origin = s.position + s.normal_g * (cone.start * world.fine.voxel)
-    march = march_cone(world.fine, world.coarse, world.has_coarse, origin, direction, cone)
+    plane = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    # The paper's form knows no sides, and a surface that shows one side has no lining.
+    if cone.additive != 0 and geo.double_sided[s.triangle] != 0:
+        n = s.normal_g
+        plane = wp.vec4(n[0], n[1], n[2], wp.dot(n, s.position))
+    march = march_cone(world.fine, world.coarse, world.has_coarse, origin, direction, plane, cone)
     sky_before = escaped(world, direction, cone.aperture, 0)
     sky_after = escaped(world, direction, cone.aperture, 1)
     open_before = int(1)
@@ -119,7 +124,7 @@ def cone_incident(
         if with_before != 0:
             shaft = cone
             shaft.split = DUAL
-            alone = march_cone(world.fine, world.coarse, world.has_coarse, origin, direction, shaft)
+            alone = march_cone(world.fine, world.coarse, world.has_coarse, origin, direction, plane, shaft)
             result.before = close_cone(alone.before, open_before, sky_before)
         delta = close_cone(march.before, open_after, sky_after - sky_before)
         result.after = result.before + delta

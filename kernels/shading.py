@@ -397,7 +397,7 @@ def shadow_cone(
         shaft.reach = (distance - 2.0 * fine.voxel) / (1.0 + 2.0 * slope)
     shaft.aperture = wp.max(aperture, 1.0e-3)
     origin = s.position + s.normal_g * (cone.start * fine.voxel)
-    result = march_cone(fine, coarse, has_coarse, origin, axis, shaft)
+    result = march_cone(fine, coarse, has_coarse, origin, axis, wp.vec4(0.0, 0.0, 0.0, 0.0), shaft)
     return wp.vec2(1.0 - wp.min(result.before[3], 1.0), 1.0 - wp.min(result.after[3], 1.0))
 
 

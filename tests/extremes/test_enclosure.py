@@ -105,6 +105,19 @@ def lantern(walls: str, center: tuple[float, float, float], half: float = 0.1, t
     return lit.mesh(np.concatenate(sheets), Role.SYNTHETIC, 0)
 
 
+FINE = {"volume__resolution": 96, "volume__coarse": 64, "rsm__texels": 256}
+
+
+def lit_from_inside(walls: str, center: tuple[float, float, float], method: str, **settings):
+    """The room with a new lamp in a closed object, and with the lamp alone; a small ball lies in a corner."""
+    light = Light(LightKind.POINT, (1.0, 1.0, 1.0), position=center, role=LightRole.ADDED)
+    corner = lit.mesh(lit.ball((0.2, 0.2, 0.3), 0.03, 4), Role.SYNTHETIC, 0)
+    return [
+        numbers(room(*objects, lights=(light,)), method, **settings)
+        for objects in ((lantern(walls, center), corner), (corner,))
+    ]
+
+
 @pytest.mark.parametrize(
     ("walls", "center", "patches", "most"),
     [
@@ -120,12 +133,15 @@ def lantern(walls: str, center: tuple[float, float, float], half: float = 0.1, t
 def test_a_lamp_in_a_closed_object_lights_nothing_else(walls, center, patches, most):
     """Eight bounces, over the light that it sends into the room without the object. 256 patches are as large as the
     object. What is left at the floor is in voxels that hold it and the object's lining, which face the same way."""
-    lamp_inside = Light(LightKind.POINT, (1.0, 1.0, 1.0), position=center, role=LightRole.ADDED)
-    far = lit.mesh(lit.ball((0.2, 0.2, 0.3), 0.03, 4), Role.SYNTHETIC, 0)
-    fine = {"volume__resolution": 96, "volume__coarse": 64, "rsm__texels": 256} if patches > 256 else {}
-    settings = {"bounces": 8, "patches__count": patches, **fine}
-    closed, free = (
-        numbers(room(*objects, lights=(lamp_inside,)), "rays", **settings).picture.mean()
-        for objects in ((lantern(walls, center), far), (far,))
-    )
-    assert closed < most * free
+    fine = FINE if patches > 256 else {}
+    closed, free = lit_from_inside(walls, center, "rays", bounces=8, patches__count=patches, **fine)
+    assert closed.picture.mean() < most * free.picture.mean()
+
+
+@pytest.mark.parametrize("walls", ["sheet", "ball"])
+def test_cones_do_not_see_the_lining_of_the_surface_that_they_leave(walls):
+    """Of a closed object with a lamp in it the outside is dark; half of the light showed on it. Other surfaces see the
+    lining in coarse voxels, as they see what is behind any wall that fills a voxel in part: a quarter of the light."""
+    closed, free = lit_from_inside(walls, IN_THE_AIR, "cones", bounces=1, shadows="ray", **FINE)
+    lit_room = free.picture[free.layers.mask_real > 0.99].mean()
+    assert closed.picture[closed.layers.mask_synthetic > 0.5].mean() < 0.05 * lit_room
