@@ -48,7 +48,7 @@ class Launcher:
         if threads is not None and threads < 1:
             raise OptionError(f"threads is {threads}; give a number of at least 1")
         self.threads = 1 if self.device.is_cuda else (threads or len(os.sched_getaffinity(0)))
-        self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
+        self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
         self.pass_seconds: dict[str, float] = {}
         self.pass_cpu_seconds: dict[str, float] = {}
         self.compile_seconds = 0.0
@@ -88,12 +88,14 @@ class Launcher:
         """Launch in slabs of ``slab`` elements; the processor seconds of all."""
         assert self._pool is not None
         waiting = deque(range(0, count, slab))
+        # This thread works too: a thread that only waits leaves its core last, and of those it woke two may share one.
         workers = [
             self._pool.submit(self._launch_slabs, kernel, waiting, slab, count, inputs, outputs)
-            for _ in range(min(self.threads, len(waiting)))
+            for _ in range(min(self.threads, len(waiting)) - 1)
         ]
         try:
-            return sum(worker.result() for worker in workers)
+            own = self._launch_slabs(kernel, waiting, slab, count, inputs, outputs)
+            return own + sum(worker.result() for worker in workers)
         finally:
             # After an interrupt the caller frees its arrays: no slab may still be writing to them.
             waiting.clear()
