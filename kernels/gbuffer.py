@@ -172,28 +172,23 @@ def _see_real(
     reach_out[i] = hit.t
 
 
-@wp.func
-def copy_point(source: Points, i: int, target: Points):
-    target.role[i] = source.role[i]
-    target.pixel[i] = source.pixel[i]
-    target.slot[i] = source.slot[i]
-    target.triangle[i] = source.triangle[i]
-    target.position[i] = source.position[i]
-    target.normal_g[i] = source.normal_g[i]
-    target.normal[i] = source.normal[i]
-    target.view[i] = source.view[i]
-    target.base_color[i] = source.base_color[i]
-    target.diffuse[i] = source.diffuse[i]
-    target.f0[i] = source.f0[i]
-    target.lobe[i] = source.lobe[i]
-    target.reach[i] = source.reach[i]
-    target.footprint[i] = source.footprint[i]
-
-
 @wp.kernel
 def _copy_points(first: int, source: Points, points_out: Points):
     i = first + wp.tid()
-    copy_point(source, i, points_out)
+    points_out.role[i] = source.role[i]
+    points_out.pixel[i] = source.pixel[i]
+    points_out.slot[i] = source.slot[i]
+    points_out.triangle[i] = source.triangle[i]
+    points_out.position[i] = source.position[i]
+    points_out.normal_g[i] = source.normal_g[i]
+    points_out.normal[i] = source.normal[i]
+    points_out.view[i] = source.view[i]
+    points_out.base_color[i] = source.base_color[i]
+    points_out.diffuse[i] = source.diffuse[i]
+    points_out.f0[i] = source.f0[i]
+    points_out.lobe[i] = source.lobe[i]
+    points_out.reach[i] = source.reach[i]
+    points_out.footprint[i] = source.footprint[i]
 
 
 @wp.kernel
@@ -204,23 +199,25 @@ def _see_synthetic(
     cam: CameraFrame,
     center: wp.vec3,
     radius: float,
-    real: Points,
     reach_in: wp.array(dtype=wp.float32),
     width: int,
     height: int,
     points_out: Points,
 ):
-    """Synthetic surfaces in front of what ``real`` holds of the real scene, and that elsewhere; all of them lie within
-    ``radius`` of ``center``."""
+    """Put synthetic surfaces in front of what ``points_out`` holds of the real scene, once those of the frame before
+    are taken out; all of them lie within ``radius`` of ``center``, and a negative one stands for none."""
     i = first + wp.tid()
-    copy_point(real, i, points_out)
     ray = camera_ray(cam, float(i % width) + 0.5, float(i / width) + 0.5, width, height)
-    if wp.length_sq(wp.cross(center - ray.origin, ray.direction)) > radius * radius:
-        return
-    hit = trace_synthetic(geo, ray.origin, ray.direction, reach_in[i])
-    if hit.found != 0:
-        spread = (cam.tan_right - cam.tan_left) / float(width)
+    spread = (cam.tan_right - cam.tan_left) / float(width)
+    hit = Hit()
+    if radius > 0.0 and wp.length_sq(wp.cross(center - ray.origin, ray.direction)) <= radius * radius:
+        hit = trace_synthetic(geo, ray.origin, ray.direction, reach_in[i])
+    if hit.found == 0 and points_out.role[i] == SYNTHETIC:
+        hit = trace_real(geo, ray.origin, ray.direction, ray.t_max)
         store_hit(geo, mats, hit, ray.origin, ray.direction, spread, i, points_out)
+    elif hit.found != 0:
+        store_hit(geo, mats, hit, ray.origin, ray.direction, spread, i, points_out)
+    points_out.slot[i] = WHOLE
 
 
 @wp.func

@@ -37,14 +37,15 @@ def pixel_centers() -> tuple[np.ndarray, np.ndarray]:
 def measure_gbuffer(launcher: Any) -> list[Deviation]:
     """Where the camera's rays end in the real scene, by brute force."""
     twin = Twin.upload(launcher, make_scene(POINT))
-    points, reach = see_real(launcher, twin.device, WIDTH, HEIGHT)
+    view = see_real(launcher, twin.device, WIDTH, HEIGHT)
+    points = view.points
     origin, direction = camera_rays(twin, *pixel_centers())
     t, triangle = twin.nearest(origin, direction, twin.real)
     normal = twin.normals[triangle]
     normal = np.where(dot(normal, direction)[:, None] > 0.0, -normal, normal)
     kernel = kernels._see_real
     return [
-        compare(kernel, "reach", reach.numpy(), t),
+        compare(kernel, "reach", view.reach.numpy(), t),
         compare(kernel, "points.position", points.position.numpy(), origin + direction * t[:, None]),
         compare(kernel, "points.normal", points.normal.numpy(), normal),
     ]

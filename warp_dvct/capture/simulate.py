@@ -180,7 +180,7 @@ class DepthEye:
         uploaded, lens = self._device_scene, self._lens
         camera: Camera = lens.scene_camera(pose)
         placed = replace(uploaded, camera=camera_frame(camera, uploaded.origin, uploaded.scale))
-        points, _ = see_real(self._launcher, placed, *lens.size)
+        points = see_real(self._launcher, placed, *lens.size).points
         inverse = np.linalg.inv(pose)
         position = points.position.numpy().astype(np.float64) / uploaded.scale + uploaded.origin
         depth = position @ inverse[2, :3] + inverse[2, 3]

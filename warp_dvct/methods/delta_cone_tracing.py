@@ -32,7 +32,7 @@ from warp_dvct.passes.gather import (
     keep_rays,
     shade_indirect,
 )
-from warp_dvct.passes.gbuffer import GBuffer, render_gbuffer, see_real
+from warp_dvct.passes.gbuffer import GBuffer, new_view, render_gbuffer
 from warp_dvct.passes.injection import empty_flux, inject
 from warp_dvct.passes.patches import bounce_field, choose_patches
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
@@ -117,11 +117,11 @@ def render(
     """
     settings, world = plan.settings, light_field.world
     with launcher.scope("gbuffer"):
-        real = None
+        view = None
         if kept is not None:
             key = content_key(scene.camera, plan.width, plan.height)
-            real = kept.get(
-                "camera's real hits", key, lambda: see_real(launcher, device_scene, plan.width, plan.height)
+            view = kept.get(
+                "camera's real hits", key, lambda: new_view(launcher, device_scene, plan.width, plan.height)
             )
         buffer = render_gbuffer(
             launcher,
@@ -132,7 +132,7 @@ def render(
             behind=with_before,
             paint=with_before or not scene.captured,
             seed=settings.seed,
-            real=real,
+            view=view,
         )
     shaded = plan.changes or with_before
     # The direct pass writes every point.

@@ -46,14 +46,36 @@ class GBuffer:
     behind_count: int
 
 
-def see_real(launcher: Launcher, scene: DeviceScene, width: int, height: int) -> tuple[Any, Any]:
-    """``Points`` of the real scene alone at the pixels' centres, and float ``[pixels]``, where their rays end."""
+@dataclass
+class View:
+    """What one camera sees at its pixels' centres, from frame to frame of a shot.
+
+    Attributes:
+        points: ``Points``, entry ``p`` is pixel ``p``: of the real scene alone at first, then with the last frame's
+            objects in it, which the next frame takes out again. What lies behind pixels is room for edge points.
+        reach: float ``[pixels]``, where rays into the real scene end.
+    """
+
+    points: Any
+    reach: Any
+
+
+def see_real(launcher: Launcher, scene: DeviceScene, width: int, height: int, *, edge_room: int = 0) -> View:
+    """The real scene alone at the pixels' centres, with room for ``edge_room`` more points behind them."""
     pixels = width * height
-    points, reach = new_points(launcher, pixels), launcher.empty(pixels, wp.float32)
+    view = View(new_points(launcher, pixels + edge_room), launcher.empty(pixels, wp.float32))
     launcher.launch(
-        kernels._see_real, pixels, [scene.geometry, scene.materials, scene.camera, width, height], [points, reach]
+        kernels._see_real,
+        pixels,
+        [scene.geometry, scene.materials, scene.camera, width, height],
+        [view.points, view.reach],
     )
-    return points, reach
+    return view
+
+
+def new_view(launcher: Launcher, scene: DeviceScene, width: int, height: int) -> View:
+    """The real scene alone, with room for the edges of most pictures."""
+    return see_real(launcher, scene, width, height, edge_room=width * height // EDGE_SHARE)
 
 
 def render_gbuffer(
@@ -66,7 +88,7 @@ def render_gbuffer(
     behind: bool,
     paint: bool = True,
     seed: int = 0,
-    real: tuple[Any, Any] | None = None,
+    view: View | None = None,
 ) -> GBuffer:
     """Trace the camera's rays.
 
@@ -74,23 +96,22 @@ def render_gbuffer(
         edge_samples: Points per edge pixel, spread over its area (box filter); 0 for no anti-aliasing.
         behind: Whether the real surfaces hidden by synthetic ones are needed (where there is no plate).
         paint: Whether colours make edges on real surfaces. A photograph that is their albedo holds means over pixels.
-        real: What :func:`see_real` gave, where that is at hand; it is not written to.
+        view: What this camera saw of this real scene (:func:`new_view`) up to the last frame; this frame's objects are
+            put into it, and its points are those of the result.
     """
     pixels = width * height
     shared = [scene.geometry, scene.materials, scene.camera]
-    centers, reach = real or see_real(launcher, scene, width, height)
-    if scene.synthetic is not None:
-        low, high = scene.synthetic_bounds
-        sphere = wp.vec3(*(0.5 * (low + high))), 0.5 * float(np.linalg.norm(high - low)) * SPHERE_MARGIN
-        seen = new_points(launcher, pixels + pixels // EDGE_SHARE)
-        launcher.launch(kernels._see_synthetic, pixels, [*shared, *sphere, centers, reach, width, height], [seen])
-        centers = seen
+    view = view or new_view(launcher, scene, width, height)
+    launcher.launch(
+        kernels._see_synthetic, pixels, [*shared, *_sphere(scene), view.reach, width, height], [view.points]
+    )
     mark = launcher.zeros(pixels, wp.int32)
     if edge_samples > 0:
-        launcher.launch(kernels._mark_edges, pixels, [centers, width, height, int(paint)], [mark])
+        launcher.launch(kernels._mark_edges, pixels, [view.points, width, height, int(paint)], [mark])
     edge_rank, edge_pixel, edges = compact(launcher, mark)
     count = pixels + edges * edge_samples
-    points = extended(launcher, centers, pixels, count)
+    view.points = extended(launcher, view.points, pixels, count)
+    points = first_points(view.points, count)
     launcher.launch(
         kernels._see_edges, edges * edge_samples, [*shared, edge_pixel, width, height, edge_samples, seed], [points]
     )
@@ -98,6 +119,14 @@ def render_gbuffer(
     if behind:
         hidden = _look_behind(launcher, scene, points, count, width)
     return GBuffer(width, height, edge_samples, points, count, edge_rank, edge_pixel, *hidden)
+
+
+def _sphere(scene: DeviceScene) -> tuple[Any, float]:
+    """Centre and radius of a sphere around the synthetic objects, which no ray meets where there are none."""
+    if scene.synthetic is None:
+        return wp.vec3(0.0, 0.0, 0.0), -1.0
+    low, high = scene.synthetic_bounds
+    return wp.vec3(*(0.5 * (low + high))), 0.5 * float(np.linalg.norm(high - low)) * SPHERE_MARGIN
 
 
 def compact(launcher: Launcher, mark: Any) -> tuple[Any, Any, int]:
@@ -119,9 +148,9 @@ def new_points(launcher: Launcher, count: int) -> Any:
 
 
 def extended(launcher: Launcher, points: Any, old: int, count: int) -> Any:
-    """The first ``old`` entries of ``points`` in arrays of ``count`` entries: the same ones where those have room."""
+    """``points``, or their first ``old`` entries in larger arrays where there is no room for ``count``."""
     if count <= points.role.shape[0]:
-        return first_points(points, count)
+        return points
     larger = new_points(launcher, count)
     launcher.launch(kernels._copy_points, old, [points], [larger])
     return larger
