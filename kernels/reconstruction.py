@@ -8,6 +8,17 @@ from warp_dvct.kernels.sampling import uniform1
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.struct
+class Gathered:
+    """The gathered point of each block of the picture, packed: every pixel asks those of the blocks around it."""
+
+    choice: wp.array(dtype=wp.int32)  # [columns * rows], the point, or -1
+    center: wp.array(dtype=wp.vec2)  # of its pixel, in pixels
+    position: wp.array(dtype=wp.vec3)
+    normal_g: wp.array(dtype=wp.vec3)
+    normal: wp.array(dtype=wp.vec3)
+
+
 @wp.kernel
 def _choose_points(
     first: int,
@@ -18,7 +29,7 @@ def _choose_points(
     columns: int,
     role: int,
     seed: int,
-    choice_out: wp.array(dtype=wp.int32),
+    gathered_out: Gathered,
 ):
     """The pixel that stands for a ``stride`` x ``stride`` block: a hashed one if it has the role, else the next that
     has; -1 where none has."""
@@ -36,7 +47,12 @@ def _choose_points(
             if x < width and y < height:
                 if points.role[y * width + x] == role:
                     found = y * width + x
-    choice_out[i] = found
+    gathered_out.choice[i] = found
+    if found >= 0:
+        gathered_out.center[i] = wp.vec2(float(found % width) + 0.5, float(found / width) + 0.5)
+        gathered_out.position[i] = points.position[found]
+        gathered_out.normal_g[i] = points.normal_g[found]
+        gathered_out.normal[i] = points.normal[found]
 
 
 @wp.struct
@@ -52,24 +68,34 @@ class Guide:
 
 
 @wp.func
-def same_surface(points: Points, i: int, j: int, guide: Guide) -> float:
-    """Weight in [0, 1] by how well two points lie in each other's tangent plane and face the same way."""
-    facing = wp.dot(points.normal[i], points.normal[j])
+def falloff(square: float) -> float:
+    """exp(-square) to within 0.08, and 0 from a square of 4 on; no call to a library."""
+    rest = wp.max(1.0 - 0.25 * square, 0.0)
+    rest = rest * rest
+    return rest * rest
+
+
+@wp.func
+def same_surface(
+    position: wp.vec3, normal_g: wp.vec3, normal: wp.vec3, tolerance: float, gathered: Gathered, block: int
+) -> float:
+    """Weight in [0, 1] by how well two points lie in each other's tangent plane and face the same way; ``tolerance`` is
+    the distance off the plane at which they hardly count."""
+    facing = wp.dot(normal, gathered.normal[block])
     if facing <= 0.0:
         return 0.0
-    offset = points.position[j] - points.position[i]
-    gap = wp.max(wp.abs(wp.dot(offset, points.normal_g[i])), wp.abs(wp.dot(offset, points.normal_g[j])))
-    gap = gap / (guide.plane * float(guide.stride) * points.footprint[i])
+    offset = gathered.position[block] - position
+    gap = wp.max(wp.abs(wp.dot(offset, normal_g)), wp.abs(wp.dot(offset, gathered.normal_g[block]))) / tolerance
     square = facing * facing
     fourth = square * square
-    return fourth * fourth * wp.exp(-gap * gap)
+    return fourth * fourth * falloff(gap * gap)
 
 
 @wp.kernel
 def _smooth(
     first: int,
     points: Points,
-    choice_in: wp.array(dtype=wp.int32),
+    gathered: Gathered,
     guide: Guide,
     spacing: int,
     mark_in: wp.array(dtype=wp.int32),
@@ -83,26 +109,29 @@ def _smooth(
     smooth there, that is over a share of the harmonic mean distance to what they see (Ward et al. 1988). Blocks that
     ``mark_in`` does not mark stay as they are."""
     i = first + wp.tid()
-    at = choice_in[i]
+    at = gathered.choice[i]
     total = float(1.0)
     before = before_in[i]
     after = after_in[i]
     if at >= 0 and mark_in[i] != 0:
         cx = i % guide.columns
         cy = i / guide.columns
-        position = points.position[at]
+        position = gathered.position[i]
+        normal = gathered.normal[i]
+        normal_g = gathered.normal_g[i]
+        tolerance = guide.plane * float(guide.stride) * points.footprint[at]
         for dy in range(-guide.radius, guide.radius + 1):
             for dx in range(-guide.radius, guide.radius + 1):
                 bx = cx + dx * spacing
                 by = cy + dy * spacing
                 if (dx != 0 or dy != 0) and bx >= 0 and by >= 0 and bx < guide.columns and by < guide.rows:
                     block = by * guide.columns + bx
-                    j = choice_in[block]
-                    if j >= 0:
+                    if gathered.choice[block] >= 0:
                         # Both must see far: a smooth point does not smooth one at a contact.
                         inverse = wp.max(nearness_in[i], nearness_in[block]) / guide.reach
-                        apart = wp.length(points.position[j] - position) * inverse
-                        weight = same_surface(points, at, j, guide) * wp.exp(-apart * apart)
+                        apart = wp.length_sq(gathered.position[block] - position) * inverse * inverse
+                        weight = falloff(apart)
+                        weight *= same_surface(position, normal_g, normal, tolerance, gathered, block)
                         if weight > 1.0e-3:
                             total += weight
                             before += before_in[block] * weight
@@ -122,9 +151,8 @@ class Interpolated:
 def interpolated(
     points: Points,
     i: int,
-    width: int,
     guide: Guide,
-    choice_in: wp.array(dtype=wp.int32),
+    gathered: Gathered,
     before_in: wp.array(dtype=wp.vec3),
     after_in: wp.array(dtype=wp.vec3),
 ) -> Interpolated:
@@ -132,23 +160,26 @@ def interpolated(
     result = Interpolated()
     px = float(points.pixel[i][0]) + 0.5
     py = float(points.pixel[i][1]) + 0.5
-    stride = float(guide.stride)
-    cx = int(wp.floor(px / stride))
-    cy = int(wp.floor(py / stride))
-    extent = float(guide.radius) + 0.5
+    position = points.position[i]
+    normal = points.normal[i]
+    normal_g = points.normal_g[i]
+    tolerance = guide.plane * float(guide.stride) * points.footprint[i]
+    cx = points.pixel[i][0] / guide.stride
+    cy = points.pixel[i][1] / guide.stride
+    extent = float(guide.stride) * (float(guide.radius) + 0.5)
+    scale = 1.0 / (extent * extent)
     total = float(0.0)
     before = wp.vec3(0.0, 0.0, 0.0)
     after = wp.vec3(0.0, 0.0, 0.0)
     for by in range(wp.max(cy - guide.radius, 0), wp.min(cy + guide.radius, guide.rows - 1) + 1):
         for bx in range(wp.max(cx - guide.radius, 0), wp.min(cx + guide.radius, guide.columns - 1) + 1):
             block = by * guide.columns + bx
-            j = choice_in[block]
-            if j >= 0:
-                dx = (float(j % width) + 0.5 - px) / stride
-                dy = (float(j / width) + 0.5 - py) / stride
-                near = wp.max(0.0, 1.0 - (dx * dx + dy * dy) / (extent * extent))
+            if gathered.choice[block] >= 0:
+                dx = gathered.center[block][0] - px
+                dy = gathered.center[block][1] - py
+                near = wp.max(0.0, 1.0 - (dx * dx + dy * dy) * scale)
                 if near > 0.0:
-                    weight = near * near * same_surface(points, i, j, guide)
+                    weight = near * near * same_surface(position, normal_g, normal, tolerance, gathered, block)
                     if weight > 1.0e-4:
                         total += weight
                         before += before_in[block] * weight
@@ -165,11 +196,10 @@ def interpolated(
 def _find_detail(
     first: int,
     points: Points,
-    width: int,
     fine_columns: int,
-    fine_choice_in: wp.array(dtype=wp.int32),
+    fine: Gathered,
     guide: Guide,
-    choice_in: wp.array(dtype=wp.int32),
+    gathered: Gathered,
     nearness_in: wp.array(dtype=wp.float32),
     before_in: wp.array(dtype=wp.vec3),
     after_in: wp.array(dtype=wp.vec3),
@@ -185,18 +215,17 @@ def _find_detail(
     block (half a block at least), over the harmonic mean distance of what that saw, plus the turn of the normal.
     """
     i = first + wp.tid()
-    j = fine_choice_in[i]
+    j = fine.choice[i]
     mark = int(0)
     nearness_out[i] = 0.0
     before_out[i] = wp.vec3(0.0, 0.0, 0.0)
     after_out[i] = wp.vec3(0.0, 0.0, 0.0)
     if j >= 0:
         block = ((i / fine_columns) / 2) * guide.columns + (i % fine_columns) / 2
-        at = choice_in[block]
         half = 0.5 * float(guide.stride) * points.footprint[j]
-        way = wp.max(wp.length(points.position[j] - points.position[at]), half) * nearness_in[block]
-        turn = wp.sqrt(wp.max(1.0 - wp.dot(points.normal[j], points.normal[at]), 0.0))
-        found = interpolated(points, j, width, guide, choice_in, before_in, after_in)
+        way = wp.max(wp.length(fine.position[i] - gathered.position[block]), half) * nearness_in[block]
+        turn = wp.sqrt(wp.max(1.0 - wp.dot(fine.normal[i], gathered.normal[block]), 0.0))
+        found = interpolated(points, j, guide, gathered, before_in, after_in)
         nearness_out[i] = nearness_in[block]
         before_out[i] = found.before
         after_out[i] = found.after
@@ -209,10 +238,9 @@ def _find_detail(
 def _reconstruct(
     first: int,
     points: Points,
-    width: int,
     role: int,
     guide: Guide,
-    choice_in: wp.array(dtype=wp.int32),
+    gathered: Gathered,
     before_in: wp.array(dtype=wp.vec3),
     after_in: wp.array(dtype=wp.vec3),
     before_out: wp.array(dtype=wp.vec3),
@@ -230,7 +258,7 @@ def _reconstruct(
         before_out[i] = wp.vec3(0.0, 0.0, 0.0)
         after_out[i] = wp.vec3(0.0, 0.0, 0.0)
     if points.role[i] == role:
-        found = interpolated(points, i, width, guide, choice_in, before_in, after_in)
+        found = interpolated(points, i, guide, gathered, before_in, after_in)
         missing = found.missing
         if missing == 0:
             before_out[i] = found.before

@@ -55,6 +55,7 @@ class Launcher:
         self.compile_cpu_seconds = 0.0
         self.live_bytes = 0
         self.peak_bytes = 0
+        self._counts: dict[int, weakref.finalize[..., Any]] = {}  # of arrays in use, by their id
         self._scopes: list[list[Any]] = []
         self._loaded: set[tuple[int, str]] = set()
         self.checker = Checker() if check else None
@@ -227,11 +228,19 @@ class Launcher:
         size = array.capacity
         self.live_bytes += size
         self.peak_bytes = max(self.peak_bytes, self.live_bytes)
-        weakref.finalize(array, self._release, size)
+        self._counts[id(array)] = weakref.finalize(array, self._release, id(array), size)
         return array
 
-    def _release(self, size: int) -> None:
+    def hand_over(self, array: wp.array) -> np.ndarray:
+        """The values of an array that nothing on the device will use again: on the CPU its own memory, without a copy,
+        which from now on is the caller's and no longer counted."""
+        if self.device.is_cpu and id(array) in self._counts:
+            self._counts[id(array)]()
+        return array.numpy()
+
+    def _release(self, key: int, size: int) -> None:
         self.live_bytes -= size
+        del self._counts[key]
 
 
 def find_device(name: str) -> Any:

@@ -252,6 +252,11 @@ def measure_bounces(launcher: Any) -> list[Deviation]:
     return [compare(bounces._bounce, "irradiance", following.numpy().reshape(count, 6), twin.reshape(count, 6))]
 
 
+def falloff(square: np.ndarray) -> np.ndarray:
+    """What stands for exp(-square)."""
+    return np.maximum(1.0 - square / 4.0, 0.0) ** 4
+
+
 def measure_reconstruction(launcher: Any) -> list[Deviation]:
     """One a-trous step over the marked ones of gathered points of a bumpy grid."""
     rng = np.random.default_rng(9)
@@ -269,13 +274,16 @@ def measure_reconstruction(launcher: Any) -> list[Deviation]:
     guide.stride, guide.columns, guide.rows, guide.radius = 6, columns, rows, 2
     guide.plane, guide.reach = 0.5, 0.25
     mark = rng.integers(0, 4, count) > 0
-    choice = launcher.array(np.arange(count, dtype=np.int32), wp.int32)
+    gathered = reconstruction.Gathered()
+    gathered.choice = launcher.array(np.arange(count, dtype=np.int32), wp.int32)
+    gathered.center = launcher.zeros(count, wp.vec2)
+    gathered.position, gathered.normal, gathered.normal_g = points.position, points.normal, points.normal_g
     light, nearness = rng.uniform(0, 3, (count, 3)), rng.uniform(0.3, 2.0, count)
     given = [launcher.array(light.astype(np.float32), wp.vec3)] * 2
     near = launcher.array(nearness.astype(np.float32), wp.float32)
     out = [launcher.empty(count, wp.vec3) for _ in range(2)]
     marked = launcher.array(mark.astype(np.int32), wp.int32)
-    launcher.launch(reconstruction._smooth, count, [points, choice, guide, 1, marked, *given, near], out)
+    launcher.launch(reconstruction._smooth, count, [points, gathered, guide, 1, marked, *given, near], out)
 
     cell = np.stack([np.arange(count) % columns, np.arange(count) // columns], 1)
     close = np.abs(cell[:, None] - cell[None]).max(-1) <= 2
@@ -283,7 +291,7 @@ def measure_reconstruction(launcher: Any) -> list[Deviation]:
     facing = np.maximum(normal @ normal.T, 0.0)
     gap = np.maximum(np.abs(np.einsum("ijx,ix->ij", offset, normal)), np.abs(np.einsum("ijx,jx->ij", offset, normal)))
     apart = np.linalg.norm(offset, axis=-1) * np.maximum(nearness[:, None], nearness[None]) / 0.25
-    weight = facing**8 * np.exp(-((gap / (0.5 * 6 * 0.01)) ** 2)) * np.exp(-(apart**2)) * close
+    weight = facing**8 * falloff((gap / (0.5 * 6 * 0.01)) ** 2) * falloff(apart**2) * close
     weight = np.where((weight > 1e-3) & mark[:, None], weight, 0.0)
     np.fill_diagonal(weight, 1.0)
     twin = weight @ light / weight.sum(1, keepdims=True)

@@ -29,7 +29,7 @@ def composite(launcher: Launcher, radiance: Radiance, plate: np.ndarray | None =
 
     Args:
         launcher: Where the arrays of ``radiance`` live.
-        radiance: Result of a method.
+        radiance: Result of a method, whose surface layers become the frame's.
         plate: The photograph, linear, float32 ``[h, w, 3]``; None takes ``radiance.before``.
     Returns:
         The finished frame. Its colour layers hold half-precision numbers as float32.
@@ -51,19 +51,24 @@ def composite(launcher: Launcher, radiance: Radiance, plate: np.ndarray | None =
         )
         wp.synchronize_device(launcher.device)
         shape = (radiance.height, radiance.width)
-        rgba_host = _to_host(rgba, shape)
+
+        def picture(array: Any) -> np.ndarray:
+            values = launcher.hand_over(array)
+            return values.reshape(*shape, *values.shape[1:])
+
+        rgba_host = picture(rgba)
         return Layers(
             rgba=rgba_host,
-            comp=_to_host(comp, shape),
-            plate=_to_host(used, shape),
-            shadow=_to_host(shadow, shape),
-            added=_to_host(added, shape),
-            delta=_to_host(delta, shape),
-            albedo=_to_host(radiance.albedo, shape),
-            normal=_to_host(radiance.normal, shape),
-            position=_to_host(radiance.position, shape),
-            depth=_to_host(radiance.depth, shape),
-            mask_real=_to_host(radiance.mask_real, shape),
+            comp=picture(comp),
+            plate=picture(used),
+            shadow=picture(shadow),
+            added=picture(added),
+            delta=picture(delta),
+            albedo=picture(radiance.albedo),
+            normal=picture(radiance.normal),
+            position=picture(radiance.position),
+            depth=picture(radiance.depth),
+            mask_real=picture(radiance.mask_real),
             mask_synthetic=rgba_host[..., 3].copy(),
             clamped=int(clamped.numpy().sum()),
             invalid=int(invalid.numpy().sum()),
@@ -83,9 +88,3 @@ def _plate_array(launcher: Launcher, radiance: Radiance, plate: np.ndarray | Non
             " the plate, it is not resampled"
         )
     return launcher.array(np.asarray(plate, np.float32).reshape(-1, 3), wp.vec3)
-
-
-def _to_host(array: Any, shape: tuple[int, int]) -> np.ndarray:
-    """A copy, so that a method may reuse its buffers in the next frame."""
-    values = array.numpy()
-    return np.array(values.reshape(*shape, *values.shape[1:]), np.float32)

@@ -109,7 +109,7 @@ class _Grid:
     """Gathered points: one of each block of ``stride`` x ``stride`` pixels.
 
     Attributes:
-        choice: int ``[columns * rows]``, the point of each block, or -1.
+        gathered: ``Gathered``, the point of each block.
         nearness: float, mean inverse distance of what the point saw.
         before, after: vec3, irradiance.
     """
@@ -117,7 +117,7 @@ class _Grid:
     stride: int
     columns: int
     rows: int
-    choice: Any
+    gathered: Any
     nearness: Any
     before: Any
     after: Any
@@ -162,10 +162,12 @@ def gather_sparse(
         kept: ``KeptRays`` with a slot per block, for the role REAL.
     """
     columns, rows = -(-buffer.width // stride), -(-buffer.height // stride)
-    choice = _choose(launcher, buffer, stride, columns, rows, role, gatherer.seed)
+    gathered = _choose(launcher, buffer, stride, columns, rows, role, gatherer.seed)
     nearness = launcher.zeros(columns * rows, wp.float32)
-    before, after = gatherer.run(launcher, buffer.points, choice, columns * rows, nearness, kept, stride=stride)
-    grid = _Grid(stride, columns, rows, choice, nearness, before, after)
+    before, after = gatherer.run(
+        launcher, buffer.points, gathered.choice, columns * rows, nearness, kept, stride=stride
+    )
+    grid = _Grid(stride, columns, rows, gathered, nearness, before, after)
     steps = smoothing if gatherer.cone is None else 0
     grid = _smooth(launcher, buffer, grid, launcher.full(grid.count, 1, wp.int32), steps)
     while detail > 0.0 and grid.stride > FINEST and grid.stride % 2 == 0 and gatherer.cone is None:
@@ -175,7 +177,7 @@ def gather_sparse(
     launcher.launch(
         reconstruction._reconstruct,
         buffer.count,
-        [buffer.points, buffer.width, int(role), guide, grid.choice, grid.before, grid.after],
+        [buffer.points, int(role), guide, grid.gathered, grid.before, grid.after],
         [*irradiance, missing],
     )
     _, index, left = compact(launcher, missing)
@@ -184,14 +186,17 @@ def gather_sparse(
 
 
 def _choose(launcher: Launcher, buffer: GBuffer, stride: int, columns: int, rows: int, role: Role, seed: int) -> Any:
-    choice = launcher.empty(columns * rows, wp.int32)
+    gathered = reconstruction.Gathered()
+    gathered.choice = launcher.empty(columns * rows, wp.int32)
+    gathered.center = launcher.empty(columns * rows, wp.vec2)
+    gathered.position, gathered.normal_g, gathered.normal = (launcher.empty(columns * rows, wp.vec3) for _ in range(3))
     launcher.launch(
         reconstruction._choose_points,
         columns * rows,
         [buffer.points, buffer.width, buffer.height, stride, columns, int(role), seed],
-        [choice],
+        [gathered],
     )
-    return choice
+    return gathered
 
 
 def _smooth(launcher: Launcher, buffer: GBuffer, grid: _Grid, mark: Any, steps: int) -> _Grid:
@@ -201,7 +206,7 @@ def _smooth(launcher: Launcher, buffer: GBuffer, grid: _Grid, mark: Any, steps: 
         launcher.launch(
             reconstruction._smooth,
             grid.count,
-            [buffer.points, grid.choice, grid.guide(2), 1 << step, mark, grid.before, grid.after, grid.nearness],
+            [buffer.points, grid.gathered, grid.guide(2), 1 << step, mark, grid.before, grid.after, grid.nearness],
             [before, after],
         )
         grid = replace(grid, before=before, after=after)
@@ -223,15 +228,15 @@ def _refine(
     points, stride = buffer.points, grid.stride // 2
     columns, rows = -(-buffer.width // stride), -(-buffer.height // stride)
     count = columns * rows
-    choice = _choose(launcher, buffer, stride, columns, rows, role, gatherer.seed)
+    gathered = _choose(launcher, buffer, stride, columns, rows, role, gatherer.seed)
     mark = launcher.empty(count, wp.int32)
     nearness = launcher.empty(count, wp.float32)
     before, after = launcher.empty(count, wp.vec3), launcher.empty(count, wp.vec3)
-    coarse = [grid.choice, grid.nearness, grid.before, grid.after]
+    coarse = [grid.gathered, grid.nearness, grid.before, grid.after]
     launcher.launch(
         reconstruction._find_detail,
         count,
-        [points, buffer.width, columns, choice, grid.guide(radius), *coarse, detail],
+        [points, columns, gathered, grid.guide(radius), *coarse, detail],
         [mark, nearness, before, after],
     )
     if change > 0.0:
@@ -239,11 +244,11 @@ def _refine(
         launcher.launch(changed_detail._unmark_unchanged, count, inputs, [mark])
     _, listed, found = compact(launcher, mark)
     index = launcher.empty(max(1, found), wp.int32)
-    launcher.launch(reconstruction._pick, found, [listed, choice], [index])
+    launcher.launch(reconstruction._pick, found, [listed, gathered.choice], [index])
     near = launcher.empty(max(1, found), wp.float32)
-    gathered = gatherer.run(launcher, points, index, found, near, stride=stride)
-    launcher.launch(reconstruction._put_detail, found, [listed, *gathered, near], [before, after, nearness])
-    return _smooth(launcher, buffer, _Grid(stride, columns, rows, choice, nearness, before, after), mark, smoothing)
+    fresh = gatherer.run(launcher, points, index, found, near, stride=stride)
+    launcher.launch(reconstruction._put_detail, found, [listed, *fresh, near], [before, after, nearness])
+    return _smooth(launcher, buffer, _Grid(stride, columns, rows, gathered, nearness, before, after), mark, smoothing)
 
 
 def gather_all(launcher: Launcher, points: Any, count: int, gatherer: Gatherer) -> tuple[Any, Any]:

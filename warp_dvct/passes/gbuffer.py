@@ -14,7 +14,7 @@ from warp_dvct.kernels.gbuffer import Points
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.sorting import scan
 
-SPHERE_MARGIN = 1.001  # of a radius: keeps rounding from culling a ray that barely meets what is in the sphere
+BOX_MARGIN = 1e-3  # of its largest edge: keeps rounding from culling a ray that barely meets what is in the box
 EDGE_SHARE = 8  # room for one edge point in so many pixels is there from the start, and saves most pictures a copy
 
 
@@ -102,9 +102,7 @@ def render_gbuffer(
     pixels = width * height
     shared = [scene.geometry, scene.materials, scene.camera]
     view = view or new_view(launcher, scene, width, height)
-    launcher.launch(
-        kernels._see_synthetic, pixels, [*shared, *_sphere(scene), view.reach, width, height], [view.points]
-    )
+    launcher.launch(kernels._see_synthetic, pixels, [*shared, *_box(scene), view.reach, width, height], [view.points])
     mark = launcher.zeros(pixels, wp.int32)
     if edge_samples > 0:
         launcher.launch(kernels._mark_edges, pixels, [view.points, width, height, int(paint)], [mark])
@@ -121,12 +119,13 @@ def render_gbuffer(
     return GBuffer(width, height, edge_samples, points, count, edge_rank, edge_pixel, *hidden)
 
 
-def _sphere(scene: DeviceScene) -> tuple[Any, float]:
-    """Centre and radius of a sphere around the synthetic objects, which no ray meets where there are none."""
+def _box(scene: DeviceScene) -> tuple[Any, Any]:
+    """Middle and half edges of a box around the synthetic objects; the edges are negative where there are none."""
     if scene.synthetic is None:
-        return wp.vec3(0.0, 0.0, 0.0), -1.0
+        return wp.vec3(0.0, 0.0, 0.0), wp.vec3(-1.0, -1.0, -1.0)
     low, high = scene.synthetic_bounds
-    return wp.vec3(*(0.5 * (low + high))), 0.5 * float(np.linalg.norm(high - low)) * SPHERE_MARGIN
+    extent = 0.5 * (high - low)
+    return wp.vec3(*(0.5 * (low + high))), wp.vec3(*(extent + BOX_MARGIN * max(float(np.max(extent)), 1.0e-30)))
 
 
 def compact(launcher: Launcher, mark: Any) -> tuple[Any, Any, int]:
