@@ -342,7 +342,19 @@ def test_calibrating_measures_every_pass(monkeypatch):
     model, samples = calibrate(frames=4, report=lambda name, share: seen.append(share))
     assert seen[-1] == 1.0
     assert len(samples) == 2 * (4 + 4 + 1)  # surveys, frames, and one of instant radiosity
-    assert {"survey", "voxelize", "rsm", "inject", "direct", "gather", "gbuffer", "rest", "ism"} <= set(model.units)
+    assert {
+        "survey",
+        "choosing",
+        "probe",
+        "voxelize",
+        "rsm",
+        "inject",
+        "direct",
+        "gather",
+        "gbuffer",
+        "rest",
+        "ism",
+    } <= set(model.units)
     assert all(value > 0 for units in model.units.values() for value in units.values())
     assert all(1.0 <= gain <= model.threads for gain in model.speedup.values())
     with pytest.raises(OptionError, match="--frames is 3"):

@@ -10,9 +10,9 @@ from known_costs import made_model
 
 from warp_dvct import Relighter
 from warp_dvct.budget import Choice, choose
-from warp_dvct.cost import price
-from warp_dvct.pace import LATER, Pace, with_rays
-from warp_dvct.settings import NAMES, Settings, make_settings
+from warp_dvct.cost import PROBE, price
+from warp_dvct.pace import LATER, Pace, try_machine, with_rays
+from warp_dvct.settings import Settings, make_settings
 from warp_dvct.survey import Survey, survey
 from warp_dvct.usd.read import read_stage
 from warp_dvct.usd_scenes import path
@@ -93,9 +93,43 @@ def test_rays_that_are_not_the_clock_s_stay(surveys, request_):
     assert chosen(surveys, seconds=5.0, method="instant-radiosity").pace is None
 
 
+def test_a_slow_machine_is_planned_for(surveys):
+    """Everything takes twice as long: half as much fits, and nothing is refused for it."""
+    usual, slow = (chosen(surveys, seconds=2.0, slowness=slowness) for slowness in (1.0, 2.0))
+    assert 0.9 * 2.0 <= slow.seconds <= 0.95 * 2.0
+    assert slow.cpu_seconds == pytest.approx(0.5 * usual.cpu_seconds, rel=0.1)
+    assert slow.floor == pytest.approx(usual.floor)
+    assert slow.error > usual.error
+    assert "takes 2.0 times as long just now" in slow.describe()
+    least = chosen(surveys, seconds=1.1 * usual.floor, slowness=3.0)
+    assert least.seconds == pytest.approx(3.0 * usual.floor)
+    # Relative to what is expected now.
+    assert price(slow.pace.count(slow.settings), slow.pace.units) == pytest.approx(slow.seconds, rel=0.1)
+
+
+@pytest.mark.parametrize(("ratio", "slowness"), [(0.3, 1.0), (1.2, 1.0), (1.6, 1.6), (100.0, 4.0)])
+def test_a_little_slowness_changes_no_plan(launcher, monkeypatch, ratio, slowness):
+    """The machine's trial against a calibrated one, by the gain of as many threads."""
+    from warp_dvct import planning
+
+    model = made_model()
+    assert planning._slowness(launcher, model) == 1.0  # calibrated before there was a trial
+    model = replace(model, units={**model.units, PROBE: {"tries": 0.01}}, speedup={**model.speedup, PROBE: 2.0})
+    monkeypatch.setattr(planning, "try_machine", lambda launcher: ratio * 0.005)
+    assert planning._slowness(launcher, model) == pytest.approx(slowness)
+
+
+def test_the_machine_s_trial_is_work_of_a_known_amount(launcher, monkeypatch):
+    from warp_dvct import pace as module
+
+    usual = try_machine(launcher)
+    monkeypatch.setattr(module, "PROBE", (module.PROBE[0], 50 * module.PROBE[1]))
+    assert 0.0 < usual < try_machine(launcher)
+
+
 def test_a_settled_frame_is_that_of_its_settings(monkeypatch, tmp_path):
-    """The first frame settles the rays; it, and the next, equal a new frame of those settings bit for bit, and the
-    second is not voxelised again."""
+    """The first frame settles the rays; it, and the next, equal a new frame of the settings that the statistics name
+    bit for bit, and the second is not voxelised again."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     relighter = Relighter(path("colour_bleeding"), width=48)
     choice = relighter.keep_budget(1.0)
@@ -108,8 +142,7 @@ def test_a_settled_frame_is_that_of_its_settings(monkeypatch, tmp_path):
     assert "settle" in relighter.stats["passes"]
     second = relighter.render()
     assert not {"settle", "voxelize", "upload"} & set(relighter.stats["passes"])
-    names = {name: getattr(relighter.settings, attribute) for name, attribute in NAMES.items()}
-    alone = Relighter(path("colour_bleeding"), width=48, settings=names).render()
+    alone = Relighter(path("colour_bleeding"), width=48, settings=choice.to_dict()["chosen"]).render()
     for layers in (first, second):
         np.testing.assert_array_equal(layers.comp, alone.comp)
         np.testing.assert_array_equal(layers.delta, alone.delta)

@@ -93,6 +93,7 @@ def choose(
     max_error: float | None = None,
     fixed: Mapping[str, Any] | None = None,
     method: str = "delta-cones",
+    slowness: float = 1.0,
 ) -> Choice:
     """The best settings that keep a time, or the cheapest that keep an error.
 
@@ -101,11 +102,13 @@ def choose(
         max_error: Mean LDR-FLIP over the picture, against a truth of many bounces.
         fixed: Settings that the user gave by dotted name; they are not chosen.
         method: ``delta-cones`` or ``instant-radiosity``.
+        slowness: By how much longer than the model says everything takes just now.
     Raises:
-        OptionError: Neither or both are given; a budget below the floor; an error that no choice reaches.
+        OptionError: Neither or both are given; a budget below the floor, however slow the machine is just now; an error
+            that no choice reaches.
     """
     check_request(seconds, max_error)
-    chooser = _Chooser(method, survey, model, load_accuracy(), width, height, threads, dict(fixed or {}))
+    chooser = _Chooser(method, survey, model, load_accuracy(), width, height, threads, dict(fixed or {}), slowness)
     return chooser.choose(seconds, max_error)
 
 
@@ -135,8 +138,10 @@ class _Chooser:
         height: int,
         threads: int,
         fixed: dict[str, Any],
+        slowness: float,
     ) -> None:
         self.method, self.survey, self.model, self.accuracy = method, survey, model, accuracy
+        self.slowness = slowness
         self.width, self.height, self.threads, self.fixed = width, height, threads, fixed
         self.base = make_settings("balanced", fixed)
         self.required = math.ceil(VOXELS_PER_FEATURE / survey.feature) if survey.feature > 0.0 else 0
@@ -146,7 +151,8 @@ class _Chooser:
             if matters(x.knob, survey) and not any(k in fixed for k in x.settings(x.values[0]))
         ]
         self.planning = {"survey": count_survey(survey), CHOOSING: {"frame": 1.0}}
-        self.prices = model.clock_units(threads)
+        units = model.clock_units(threads)
+        self.prices = {name: {unit: slowness * cost for unit, cost in costs.items()} for name, costs in units.items()}
         self.reference = accuracy.reference(survey, width, method) if survey.changes else 0.0
         self.excesses: dict[tuple[str, float, float], float] = {}
 
@@ -189,13 +195,14 @@ class _Chooser:
 
     def choose(self, budget: float | None, max_error: float | None) -> Choice:
         state = {ladder.knob: ladder.values[0] for ladder in self.ladders}
-        floor = self.seconds(self.settings(state))
+        slow_floor = self.seconds(self.settings(state))
+        floor = slow_floor / self.slowness
         if budget is not None and budget < floor:
             raise OptionError(
                 f"--budget {budget:g} s is below the floor: the cheapest picture of this scene at {self.width} x"
                 f" {self.height} takes about {floor:.2f} s on {self.threads} thread(s); raise it or lower --imageWidth"
             )
-        aim = math.inf if budget is None else max(AIM * budget, floor)
+        aim = math.inf if budget is None else max(AIM * budget, slow_floor)
         state, last, stopped = self._climb(state, aim, max_error)
         if max_error is not None and math.sqrt(self.square(self.settings(state))) > max_error:
             least = math.sqrt(self.square(self.settings(state)))
@@ -300,7 +307,7 @@ class _Chooser:
         return Choice(
             self.method,
             settings,
-            self.model.seconds(work, self.threads),
+            self.seconds(settings),
             self.model.cpu_seconds(work),
             self.accuracy.error(settings, self.survey, self.width, self.method),
             floor,
@@ -340,6 +347,8 @@ class _Chooser:
                 f"the smallest object extends {survey.feature * settings.volume_resolution:.1f} voxels where"
                 f" {VOXELS_PER_FEATURE:g} are needed: light leaks through it; --set volume.resolution={self.required}"
             )
+        if self.slowness > 1.0:
+            lines.append(f"the machine takes {self.slowness:.1f} times as long just now as when it was calibrated")
         if self.model.shipped:
             lines.append("the times are those of another machine: `warp-dvct calibrate` measures this one's")
         return lines

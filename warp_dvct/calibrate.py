@@ -12,10 +12,22 @@ import numpy as np
 from warp_dvct import usd_scenes
 from warp_dvct.accuracy import LADDERS_OF, RAYS
 from warp_dvct.budget import choose
-from warp_dvct.cost import CHOOSING, REST, CostModel, Sample, count_survey, count_work, fit, processor, shipped_model
+from warp_dvct.cost import (
+    CHOOSING,
+    PROBE,
+    REST,
+    CostModel,
+    Sample,
+    count_survey,
+    count_work,
+    fit,
+    processor,
+    shipped_model,
+)
 from warp_dvct.cost_vpls import RENAMED, count_vpl_work
 from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher
+from warp_dvct.pace import try_machine
 from warp_dvct.relighter import Relighter
 from warp_dvct.scene import Mesh, Scene
 from warp_dvct.settings import make_settings
@@ -73,7 +85,7 @@ def calibrate(
 def _look(
     name: str, scene: Scene, launcher: Launcher, rng: np.random.Generator, *, plate: bool
 ) -> tuple[Sample, Survey]:
-    """The survey, and a search for settings, timed: the lesser of a few."""
+    """The survey, a search for settings and the machine's trial, timed: the lesser of a few."""
     seconds = float(np.exp(rng.uniform(*np.log(BUDGETS))))
     found, times = None, []
     for _ in range(REPEATS):
@@ -83,11 +95,13 @@ def _look(
         start = _Clock(launcher)
         width, height = SEARCHED
         choose(found, shipped_model(), width=width, height=height, threads=launcher.threads, seconds=seconds)
-        times.append((surveyed, start.spent()))
+        chosen = start.spent()
+        probed = try_machine(launcher)
+        times.append((surveyed, chosen, (launcher.threads * probed, probed)))
     assert found is not None
-    work = {"survey": count_survey(found), CHOOSING: {"frame": 1.0}}
-    surveyed, chosen = (min(t[k] for t in times) for k in (0, 1))
-    cpu, wall = ({"survey": surveyed[k], CHOOSING: chosen[k]} for k in (0, 1))
+    work = {"survey": count_survey(found), CHOOSING: {"frame": 1.0}, PROBE: {"tries": 1.0}}
+    least = {name: min(t[k] for t in times) for k, name in enumerate(work)}
+    cpu, wall = ({name: seconds[k] for name, seconds in least.items()} for k in (0, 1))
     return Sample(work, wall if launcher.device.is_cuda else cpu, wall, f"{name} survey"), found
 
 

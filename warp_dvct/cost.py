@@ -28,6 +28,7 @@ from warp_dvct.survey import MapNeed, PointNeed, Survey, VolumeNeed
 DEFAULT_FILE = Path(__file__).with_name("cost.json")
 REST = "rest"  # of a frame's time, what is in no pass
 CHOOSING = "choosing"  # the search for settings
+PROBE = "probe"  # work of a known amount, by which a plan sees how fast the machine is just now
 # A point's first rays find less in the processor's caches than its later ones: 16, 64 and 256 rays a point took 1.27,
 # 1.13 and 1.07 times as long each as many (mean of eight bundled stages, one thread).
 FIRST_RAYS = 1.1

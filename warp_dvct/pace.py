@@ -16,6 +16,7 @@ import warp as wp
 
 from warp_dvct.cost import REST, Counts, gathered, gathered_points, price
 from warp_dvct.device_scene import DeviceScene
+from warp_dvct.kernels import probe
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.gather import Gatherer, glossy_hits
 from warp_dvct.passes.gbuffer import render_gbuffer
@@ -33,9 +34,23 @@ TRIAL_SHARE = 0.01  # of what is left, for all trials
 LEAST_POINTS = 128  # of a trial: every thread has several
 RUN = 32  # of neighbours: their rays meet the same surfaces, so the processor's caches hold what they read
 MOST_TRIED = 128  # rays a point of a trial: more take in proportion
+PROBE = 4096, 200  # elements and steps of the machine's trial: 5 ms on one thread
 SLOWNESS = (0.4, 4.0)  # measured over predicted seconds that are believed
 RAYS_SET = ("gather.rays", "gather.object_rays")  # what is settled
 LATER = ("direct", "specular", "resolve", "composite", "gbuffer", REST)  # passes that do not run before
+
+
+def try_machine(launcher: Launcher) -> float:
+    """Seconds of the clock that all threads take for work of a known amount, ``PROBE``: the median of a few tries."""
+    value = launcher.empty(PROBE[0], wp.float32)
+    seconds = []
+    for _ in range(1 + TRIALS):
+        launcher.load(probe._work.module)
+        start = time.perf_counter()
+        launcher.launch(probe._work, PROBE[0], [PROBE[1]], [value])
+        wp.synchronize_device(launcher.device)
+        seconds.append(time.perf_counter() - start)
+    return float(np.median(seconds[1:]))  # the first wakes the threads
 
 
 @dataclass(frozen=True)

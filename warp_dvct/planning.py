@@ -12,18 +12,20 @@ import numpy as np
 import warp as wp
 
 from warp_dvct.budget import AIM, Choice, check_request, choose
-from warp_dvct.cost import load_model
+from warp_dvct.cost import PROBE, CostModel, load_model, price
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher
 from warp_dvct.layers import Radiance
 from warp_dvct.methods.path_tracing import PathTracer
 from warp_dvct.metrics import to_display
+from warp_dvct.pace import SLOWNESS, try_machine
 from warp_dvct.plan import make_plan
 from warp_dvct.scene import Scene
 from warp_dvct.settings import Settings, make_settings
 from warp_dvct.survey import survey
 
+SLOW = 1.3  # of the time that the machine's trial took at calibration: up to there rays alone make up for it
 PILOT_PIXELS = 5_000  # about, of the picture that tells what paths cost and how noisy they are
 PILOT_SAMPLES = 4
 # Mean FLIP over the mean difference in display values: 1.9 to 3.0 in four stages at 1, 4 and 16 samples a pixel.
@@ -50,9 +52,10 @@ def choose_settings(
         return _path_trace(scene, launcher, width, height, seconds, max_error, fixed)
     start, compiled = time.perf_counter(), launcher.compile_seconds
     found = survey(scene, make_settings("balanced", fixed), launcher, width / height, has_plate=has_plate)
+    model = load_model("cpu" if launcher.device.is_cpu else launcher.device.alias)
     choice = choose(
         found,
-        load_model("cpu" if launcher.device.is_cpu else launcher.device.alias),
+        model,
         width=width,
         height=height,
         threads=launcher.threads,
@@ -60,10 +63,21 @@ def choose_settings(
         max_error=max_error,
         fixed=fixed,
         method=method,
+        slowness=1.0 if seconds is None else _slowness(launcher, model),
     )
     if choice.pace is not None:
         choice.pace.spent = time.perf_counter() - start - (launcher.compile_seconds - compiled)
     return choice
+
+
+def _slowness(launcher: Launcher, model: CostModel) -> float:
+    """By how much longer than when ``model`` was measured this machine takes just now; 1 where that is little, for the
+    same scene and budget to give the same settings."""
+    expected = price({PROBE: {"tries": 1.0}}, model.clock_units(launcher.threads))
+    if expected <= 0.0:
+        return 1.0  # measured before there was a trial
+    slowness = try_machine(launcher) / expected
+    return min(slowness, SLOWNESS[1]) if slowness > SLOW else 1.0
 
 
 @dataclass(frozen=True)
