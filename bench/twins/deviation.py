@@ -56,7 +56,8 @@ def measure_all(launcher: Any) -> list[Deviation]:
         *(volumes.measure_albedos, surfaces.measure_indirect_shading),
         indirect.measure_reconstruction,
         *(vpls.measure_warping, vpls.measure_vpls, vpls.measure_vpl_bounces, frames.measure_history),
-        *(frames.measure_lens, frames.measure_light_fit, pictures.measure_resolve, pictures.measure_pictures),
+        *(frames.measure_lens, frames.measure_light_fit, frames.measure_light_fit_jacobian),
+        *(pictures.measure_resolve, pictures.measure_pictures),
     ]
     for measure in measures:
         found += measure(launcher)

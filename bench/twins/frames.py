@@ -194,3 +194,74 @@ def measure_light_fit(launcher: Any) -> list[Deviation]:
     free = np.isinf(twin.nearest(origin[each], d, twin.real)[0])
     expected = np.maximum(dot(d, normal[each]), 0.0) * free
     return [*rows, compare(light_fit._try_directions, "cosine", cosines.numpy(), expected)]
+
+
+STEP = 1e-5  # of the central differences: their own error is its square
+
+
+def measure_light_fit_jacobian(launcher: Any) -> list[Deviation]:
+    """The Jacobian that lights are fitted by: the kernel's adjoints against central differences of its twin in float64.
+
+    By the dome's coefficients, by the direction of a distant light and by the place of a near one. What is seen stays
+    seen.
+    """
+    twin = Twin.upload(launcher, make_scene(SUN, closed=False))
+    _, position, normal, triangle = places(launcher, twin)
+    origin = twin.spawn(position, triangle, normal).astype(np.float32)
+    count = len(origin)
+    lights = upload_lights(launcher, tuple(SUN if i % 2 else POINT for i in range(count)), np.zeros(3), 1.0)
+    coefficients: Any = wp.zeros(9 * count, dtype=wp.vec3, device=launcher.device, requires_grad=True)
+    by: Any = [wp.clone(values, requires_grad=True) for values in (lights.position, lights.direction)]
+    lights.position, lights.direction = by
+    arrays = [launcher.array(v, wp.vec3) for v in (origin, normal.astype(np.float32))]
+    kinds = (wp.vec3, wp.vec3, wp.float32)
+    outputs = [wp.zeros(count, dtype=kind, device=launcher.device, requires_grad=True) for kind in kinds]
+    ones = wp.full(count, wp.vec3(1.0, 1.0, 1.0), wp.vec3, device=launcher.device)
+    inputs = [twin.device.geometry, lights, *arrays, coefficients, RAYS, 1, 0]
+    launcher.differentiate(light_fit._light_points, count, inputs, outputs, {outputs[0]: ones, outputs[1]: ones})
+
+    origin = origin.astype(float)
+    rays = [from_frame(cosine_hemisphere(sobol2(0, np.arange(count), j, 0)), normal) for j in range(RAYS)]
+    free = [np.isinf(twin.nearest(origin, d, twin.real)[0]) for d in rays]
+
+    def dome(x: np.ndarray) -> np.ndarray:
+        """Irradiance of harmonics with coefficients ``[n, 9, 3]``."""
+        basis = sum((harmonics(d) * f[:, None] for d, f in zip(rays, free, strict=True)), np.zeros((count, 9)))
+        return np.einsum("nk,nkc->nc", basis, x) * (np.pi / RAYS)
+
+    def near(place: np.ndarray) -> np.ndarray:
+        return irradiance(replace(POINT, position=place), slice(0, None, 2))
+
+    def distant(direction: np.ndarray) -> np.ndarray:
+        return irradiance(replace(SUN, direction=direction), slice(1, None, 2))
+
+    def irradiance(source: Any, mine: slice) -> np.ndarray:
+        d, _, value = sample_light(source, origin[mine])
+        return value * (np.maximum(dot(d, normal[mine]), 0.0) * open_to[mine])[:, None]
+
+    open_to = np.zeros(count)
+    for kind, source in enumerate((POINT, SUN)):
+        mine = slice(kind, None, 2)
+        d, distance, _ = sample_light(source, origin[mine])
+        open_to[mine] = twin.nearest(origin[mine], d, twin.real)[0] >= distance
+
+    kernel, half = light_fit._light_points, count // 2
+    by_dome = differences(dome, np.zeros((count, 9, 3)))
+    by_place = differences(near, np.tile(np.asarray(POINT.position), (half, 1)))
+    by_direction = differences(distant, np.tile(np.asarray(SUN.direction), (half, 1)))
+    got = coefficients.grad.numpy().reshape(count, 27)
+    return [
+        compare(kernel, "Jacobian, harmonics", got, by_dome.reshape(count, 27)),
+        compare(kernel, "Jacobian, position", by[0].grad.numpy()[::2], by_place),
+        compare(kernel, "Jacobian, direction", by[1].grad.numpy()[1::2], by_direction),
+    ]
+
+
+def differences(function: Any, x: np.ndarray) -> np.ndarray:
+    """Derivative of the sum of a row's channels by each number of that row of ``x``, in ``x``'s shape."""
+    out = np.zeros_like(x)
+    for at in np.ndindex(x.shape[1:]):
+        step = np.zeros_like(x)
+        step[(slice(None), *at)] = STEP
+        out[(slice(None), *at)] = (function(x + step) - function(x - step)).sum(-1) / (2.0 * STEP)
+    return out
