@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,22 +32,23 @@ def chosen(surveys, stage: str = "room_area", **request) -> Choice:
 
 
 class Machine:
-    """Stands for a launcher under a clock of its own: a frame has taken ``slowness`` times what was predicted."""
+    """Stands for a launcher under a clock of its own: passes have taken ``speed`` times their predicted processor time,
+    and threads ``stall`` times as long by the clock as such processor time should take them."""
 
     compile_seconds = 0.0
-    device = None
+    device = SimpleNamespace(is_cuda=False)
 
-    def __init__(self, pace: Pace, settings: Settings, slowness: float) -> None:
-        work = pace.count(settings)
-        done = {name: counts for name, counts in work.items() if name not in (*LATER, "gather")}
-        self.pass_seconds = {name: slowness * price({name: counts}, pace.units) for name, counts in done.items()}
+    def __init__(self, pace: Pace, settings: Settings, speed: float, stall: float = 1.0) -> None:
+        done = {name: c for name, c in pace.count(settings).items() if name not in (*LATER, "gather")}
+        self.pass_cpu_seconds = {name: speed * price({name: c}, pace.cpu_units) for name, c in done.items()}
+        self.pass_seconds = {name: speed * stall * price({name: c}, pace.units) for name, c in done.items()}
 
 
 @pytest.mark.parametrize(("stage", "budget"), [("room_area", 1.0), ("room_glossy", 4.0), ("ground_dome", 20.0)])
-@pytest.mark.parametrize("slowness", [0.7, 1.0, 1.4])
-def test_rays_take_what_is_left_of_the_time(surveys, monkeypatch, stage, budget, slowness):
-    """On a machine of a known speed, where rays cost by another factor than the rest: planning, what was done, what is
-    still to do and the settled rays add up to what is aimed at."""
+@pytest.mark.parametrize(("speed", "stall"), [(0.7, 1.0), (1.0, 1.0), (0.8, 1.9), (1.4, 1.1)])
+def test_rays_take_what_is_left_of_the_time(surveys, monkeypatch, stage, budget, speed, stall):
+    """On a machine of a known speed whose cores others use too, where rays cost by another factor than the rest:
+    planning, what was done, what is still to do and the settled rays add up to what is aimed at."""
     from warp_dvct import pace as module
 
     choice = chosen(surveys, stage, seconds=budget)
@@ -54,9 +56,9 @@ def test_rays_take_what_is_left_of_the_time(surveys, monkeypatch, stage, budget,
     now = iter((100.0, 100.0 + 0.3 * budget, 100.0 + 0.3 * budget))
     monkeypatch.setattr(module.time, "perf_counter", lambda: next(now))
     monkeypatch.setattr(module.wp, "synchronize_device", lambda device: None)
-    monkeypatch.setattr(Pace, "_try_rays", lambda self, *args: 0.8 * slowness)
+    monkeypatch.setattr(Pace, "_try_rays", lambda self, *args: 0.8 * speed)
     pace.spent = 0.05 * budget
-    machine = Machine(pace, settings, slowness)
+    machine, slowness = Machine(pace, settings, speed, stall), speed * stall
     pace.begin(machine)
     made = pace.settle(machine, None, None, None, settings)
     assert pace.settled.slowness == pytest.approx(slowness)
@@ -105,6 +107,15 @@ def test_a_slow_machine_is_planned_for(surveys):
     assert least.seconds == pytest.approx(3.0 * usual.floor)
     # Relative to what is expected now.
     assert price(slow.pace.count(slow.settings), slow.pace.units) == pytest.approx(slow.seconds, rel=0.1)
+
+
+def test_half_of_a_sudden_speed_is_believed(surveys):
+    usual, slow = (chosen(surveys, seconds=2.0, slowness=slowness).pace for slowness in (1.0, 4.0))
+    assert usual._believed(0.6) == pytest.approx(0.6)
+    assert slow._believed(0.6) == pytest.approx(0.6)
+    assert slow._believed(0.25) == pytest.approx(0.5)  # as fast as calibrated: twice as fast as that is planned with
+    assert slow._believed(0.2) == pytest.approx(0.4)  # faster still: in proportion
+    assert slow._believed(9.0) == usual._believed(9.0) == pytest.approx(4.0)
 
 
 @pytest.mark.parametrize(("ratio", "slowness"), [(0.3, 1.0), (1.2, 1.0), (1.6, 1.6), (100.0, 4.0)])

@@ -230,7 +230,9 @@ class _Chooser:
         def count(settings: Settings) -> dict[str, Counts]:
             return count_work(settings, self.survey, self.width, self.height)
 
-        return Pace(self.survey, self.width, self.height, aim, self.prices, count, least, most)
+        return Pace(
+            self.survey, self.width, self.height, aim, self.prices, self.model.units, count, least, most, self.slowness
+        )
 
     def _climb(
         self, state: dict[str, float], aim: float, max_error: float | None

@@ -7,7 +7,7 @@ this scene. What is left of the time decides. All other settings follow from the
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -37,6 +37,7 @@ MOST_TRIED = 128  # rays a point of a trial: more take in proportion
 PROBE = 4096, 200  # elements and steps of the machine's trial: 5 ms on one thread
 SLOWNESS = (0.4, 4.0)  # measured over predicted seconds that are believed
 RAYS_SET = ("gather.rays", "gather.object_rays")  # what is settled
+BUSY = 0.9  # of the largest gain by threads: passes with less leave threads idle
 LATER = ("direct", "specular", "resolve", "composite", "gbuffer", REST)  # passes that do not run before
 
 
@@ -77,10 +78,10 @@ class Pace:
         aim: Seconds that the planning and the frame are to take together: all of the budget, for rays on trial take 1.1
             times as long as the gather's (mean of five stages at two budgets; 0.9 to 1.4), whose points' neighbours
             have brought the scene into the caches.
-        units: Seconds of the clock by pass and unit, see ``CostModel.clock_units``.
+        units: Seconds of the clock by pass and unit, see ``CostModel.clock_units``. cpu_units: Of the processor.
         count: From settings to counts by pass of a frame.
         least, most: Rays of a point.
-        spent: Seconds of the planning.
+        slowness: By which ``units`` were made dearer, see ``planning``. spent: Seconds of the planning.
         settled: Once the first frame was rendered.
     """
 
@@ -89,9 +90,11 @@ class Pace:
     height: int
     aim: float
     units: dict[str, Counts]
+    cpu_units: dict[str, Counts]
     count: Callable[[Settings], dict[str, Counts]]
     least: int
     most: int
+    slowness: float = 1.0
     spent: float = 0.0
     settled: Settled | None = None
     _began: tuple[float, float] = field(default=(0.0, 0.0), repr=False)
@@ -107,19 +110,44 @@ class Pace:
         wp.synchronize_device(launcher.device)
         work = self.count(settings)
         done = {name: work[name] for name in launcher.pass_seconds if name in work and name not in (*LATER, "gather")}
-        slowness = _ratio(sum(launcher.pass_seconds[name] for name in done), price(done, self.units))
+        predicted = price(done, self.units)
+        measured = sum(launcher.pass_seconds[name] for name in done)
+        slowness = self._believed(measured / predicted if predicted > 0.0 else 1.0)
         later = slowness * price({name: work[name] for name in LATER if name in work}, self.units)
-        rays_slowness = self._try_rays(launcher, scene, device_scene, lit, settings, self._left(launcher) - later)
+        left = self._left(launcher) - later
+        tried = self._try_rays(launcher, scene, device_scene, lit, settings, left)
+        ray_slowness = self._believed(tried * self._stall(launcher, done) / self.slowness)
         left = self._left(launcher) - later
         low, high = self.least, self.most
         while low < high:
             middle = (low + high + 1) // 2
-            if rays_slowness * self._gather_seconds(with_rays(settings, middle)) <= left:
+            if ray_slowness * self._gather_seconds(with_rays(settings, middle)) <= left:
                 low = middle
             else:
                 high = middle - 1
-        self.settled = Settled(low, settings.gather_rays, slowness, rays_slowness)
+        self.settled = Settled(low, settings.gather_rays, slowness, ray_slowness)
         return with_rays(settings, low)
+
+    def _believed(self, slowness: float) -> float:
+        """Measured over predicted seconds, within bounds. A machine that was slow when the plan was made, and no longer
+        is, may soon be slow again: of such a change half is believed."""
+        half = self.slowness**-0.5 * min(1.0, slowness * self.slowness)
+        return float(np.clip(max(slowness, half), *SLOWNESS))
+
+    def _stall(self, launcher: Launcher, done: Mapping[str, Counts]) -> float:
+        """By how much longer threads took by the clock for their processor time than when they were calibrated, in the
+        passes that keep all of them busy: other processes and the machine's host take cores away."""
+        if launcher.device.is_cuda:
+            return 1.0
+        gains = {}
+        for name, counts in done.items():
+            clock, processor = (price({name: counts}, units) for units in (self.units, self.cpu_units))
+            if clock > 0.0:
+                gains[name] = processor * self.slowness / clock
+        busy = [name for name, gain in gains.items() if gain >= BUSY * max(gains.values())]
+        expected = sum(launcher.pass_cpu_seconds[name] / gains[name] for name in busy)
+        measured = sum(launcher.pass_seconds[name] for name in busy)
+        return float(np.clip(measured / expected, 1.0 / SLOWNESS[1], SLOWNESS[1])) if expected > 0.0 else 1.0
 
     def _left(self, launcher: Launcher) -> float:
         """Seconds of what is aimed at that are not spent yet; loading and compiling do not count."""
@@ -138,8 +166,11 @@ class Pace:
         settings: Settings,
         left: float,
     ) -> float:
-        """Measured over predicted seconds of rays, from points spread over a small picture in the proportion of real
-        surfaces and objects in which the gather will find them."""
+        """Measured over predicted processor time of rays, from points spread over a small picture in the proportion of
+        real surfaces and objects in which the gather will find them.
+
+        By the clock a trial of milliseconds says little: it is over before, or all within, another process's turn.
+        """
         rays, height = min(settings.gather_rays, MOST_TRIED), max(1, round(WIDTH * self.height / self.width))
         buffer = render_gbuffer(launcher, device_scene, WIDTH, height, edge_samples=0, behind=False)
         role = buffer.points.role.numpy()[: WIDTH * height]
@@ -147,7 +178,7 @@ class Pace:
         first, again, objects = gathered_points(settings, self.survey, self.width, self.height)
         share = objects / max(first + again + objects, 1.0)
         one = self._trial_seconds(1.0 - share, share, rays)
-        wanted = max(LEAST_TRIAL, TRIAL_SHARE * left / TRIALS) / max(one, 1e-9)
+        wanted = launcher.threads * max(LEAST_TRIAL, TRIAL_SHARE * left / TRIALS) / max(one, 1e-9)
         points = int(np.clip(wanted, LEAST_POINTS, len(role)))
         hits = glossy_hits(launcher, scene, device_scene, lit.bounces, settings.seed)
         gatherer = Gatherer(device_scene, lit.world, rays, settings.seed, hits=hits)
@@ -157,16 +188,17 @@ class Pace:
             chosen = [_spread(pixels, n, k) for pixels, n in zip(found, numbers, strict=True)]
             index = launcher.array(np.concatenate(chosen).astype(np.int32), wp.int32)
             predicted = self._trial_seconds(len(chosen[0]), len(chosen[1]), rays)
-            start, compiled = time.perf_counter(), launcher.compile_seconds
+            now = time.perf_counter if launcher.device.is_cuda else time.process_time
+            start = now()
             gatherer.run(launcher, buffer.points, index, index.shape[0], stride=settings.gather_stride)
             wp.synchronize_device(launcher.device)
-            ratios.append(_ratio(time.perf_counter() - start - (launcher.compile_seconds - compiled), predicted))
+            ratios.append((now() - start) / predicted)
         return float(np.median(ratios))
 
     def _trial_seconds(self, real: float, objects: float, rays: int) -> float:
-        """Predicted, of rays from some points on real surfaces and on objects."""
+        """Predicted processor time of rays from some points on real surfaces and on objects."""
         wheres = (self.survey.on_real, real), (self.survey.on_object, objects)
-        return sum(price({"gather": gathered(self.survey, w, n, rays)}, self.units) for w, n in wheres)
+        return sum(price({"gather": gathered(self.survey, w, n, rays)}, self.cpu_units) for w, n in wheres)
 
 
 def _spread(pixels: np.ndarray, count: int, trial: int) -> np.ndarray:
@@ -181,7 +213,3 @@ def _spread(pixels: np.ndarray, count: int, trial: int) -> np.ndarray:
 def with_rays(settings: Settings, rays: int) -> Settings:
     """``settings`` with as many gathered rays of every point."""
     return replace(settings, **{NAMES[name]: rays for name in RAYS_SET})
-
-
-def _ratio(measured: float, predicted: float) -> float:
-    return float(np.clip(measured / max(predicted, 1e-6), *SLOWNESS))
