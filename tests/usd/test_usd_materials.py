@@ -173,6 +173,22 @@ def test_transform2d_scales_then_turns_then_moves(build, tmp_path):
     np.testing.assert_allclose(build.one().corner_uvs, expected, atol=1e-6)
 
 
+def test_coordinates_that_go_in_a_circle_are_refused(build, tmp_path):
+    """Following them would never end."""
+    textured(build, write_image(tmp_path / "c.png", np.full((2, 2, 3), 51)), "diffuseColor")
+    nodes = [UsdShade.Shader.Define(build.stage, f"/World/Looks/Mat/Turn{k}") for k in range(2)]
+    for node, other in (nodes, nodes[::-1]):
+        node.CreateIdAttr("UsdTransform2d")
+        node.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+        node.CreateInput("in", Sdf.ValueTypeNames.Float2).ConnectToSource(other.ConnectableAPI(), "result")
+    texture = next(p for p in build.stage.Traverse() if p.GetAttribute("info:id").Get() == "UsdUVTexture")
+    UsdShade.Shader(texture).CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(
+        nodes[0].ConnectableAPI(), "result"
+    )
+    with pytest.raises(StageError, match="/World/Looks/Mat/Turn0: its input is its own output, through a circle"):
+        build.read()
+
+
 def test_missing_coordinates_use_the_fallback_of_the_reader_and_are_listed(build, tmp_path):
     _, reader = textured(build, write_image(tmp_path / "c.png", RAMP))
     build.stage.GetPrimAtPath("/World/Mesh").RemoveProperty("primvars:st")

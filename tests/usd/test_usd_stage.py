@@ -62,6 +62,35 @@ def test_units_that_are_not_positive_are_refused(build):
         build.read()
 
 
+def test_an_up_axis_that_usd_does_not_know_is_refused(build):
+    build.stage.SetMetadata("upAxis", "X")
+    with pytest.raises(StageError, match=r"upAxis is X; it must be Y or Z"):
+        build.read()
+
+
+def test_transforms_that_are_ordered_and_not_there_are_listed(build):
+    """As after deleting one by hand; USD draws the prim without it and says nothing."""
+    quad = UsdGeom.Xformable(build.quad())
+    quad.AddTranslateOp().Set((1, 0, 0))
+    quad.AddTranslateOp(opSuffix="pivot").Set((0, 1, 0))
+    quad.AddTranslateOp(opSuffix="pivot", isInverseOp=True)
+    assert build.read().notices == ()
+    quad.GetXformOpOrderAttr().Set(["xformOp:translate", "xformOp:rotateY", "!invert!xformOp:scale"])
+    told = [str(n) for n in build.read().notices]
+    assert told == [
+        "/World/Mesh: xformOpOrder names xformOp:rotateY, which is not there; left out",
+        "/World/Mesh: xformOpOrder names xformOp:scale, which is not there; left out",
+    ]
+
+
+def test_a_notice_is_one_line(build):
+    """Composition errors of USD span several."""
+    build.quad().GetPrim().GetReferences().AddInternalReference("/World")
+    (told,) = build.read().notices
+    assert "Cycle detected" in told.message
+    assert "\n" not in str(told)
+
+
 def test_a_z_up_stage_is_turned_not_mirrored(build, measure):
     UsdGeom.SetStageUpAxis(build.stage, "Z")
     build.mesh([(0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3)], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])

@@ -118,6 +118,7 @@ class Collector:
             local = matrix(xformable.GetLocalTransformation(time))
             if not np.isfinite(local).all():
                 raise StageError(f"{prim.GetPath()}: its transform has NaN or infinite values; repair its xformOps")
+            self._note_missing_ops(xformable)
             if xformable.GetResetXformStack():
                 changes["matrices"] = (local @ self._ctx.to_world)[None]
             elif not np.array_equal(local, np.eye(4)):
@@ -134,6 +135,14 @@ class Collector:
         if tags is not above.tags:
             changes["tags"] = tags
         return replace(above, **changes) if changes else above
+
+    def _note_missing_ops(self, xformable: Any) -> None:
+        """List operations that the prim orders and does not have: USD leaves them out without a word."""
+        prim = xformable.GetPrim()
+        for name in xformable.GetXformOpOrderAttr().Get(self._ctx.time) or ():
+            attribute = name.removeprefix("!invert!")
+            if not attribute.startswith("!") and not prim.HasAttribute(attribute):
+                self._ctx.notices.add(prim.GetPath(), f"xformOpOrder names {attribute}, which is not there; left out")
 
     def _visit(self, prim: Usd.Prim, state: _State) -> None:
         from pxr import UsdGeom, UsdLux

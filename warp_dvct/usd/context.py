@@ -20,8 +20,8 @@ class Notices:
         self._seen: dict[tuple[str, str], Notice] = {}
 
     def add(self, path: Any, message: str) -> None:
-        """Note that ``message`` holds for the prim at ``path``."""
-        key = (str(path), message)
+        """Note that ``message`` holds for the prim at ``path``; it becomes one line."""
+        key = (str(path), " ".join(message.split()))
         self._seen.setdefault(key, Notice(*key))
 
     def all(self) -> tuple[Notice, ...]:

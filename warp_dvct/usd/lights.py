@@ -17,6 +17,7 @@ from warp_dvct.usd.textures import ImageCache, as_rgb, asset_file
 if TYPE_CHECKING:
     from pxr import Usd
 
+BRIGHTEST = 1e30  # emission whose sums and squares over a picture float32 still holds
 TUBE_FACES = 8  # of the prism that stands for a CylinderLight
 EVEN = 1e-3  # relative difference of scales from which a sphere counts as stretched
 
@@ -75,9 +76,9 @@ def _emission(e: _Emitter) -> np.ndarray:
     value = np.array(e.get("inputs:color"), dtype=np.float64) * intensity * 2.0**exposure
     if e.get("inputs:enableColorTemperature", False):
         value = value * np.array(UsdLux.BlackbodyTemperatureAsRgb(float(e.get("inputs:colorTemperature"))))
-    if not np.isfinite(value).all() or (value < 0.0).any():
+    if not (np.abs(value) < BRIGHTEST).all() or (value < 0.0).any():
         raise StageError(
-            f"{e.path}: its emission {tuple(map(float, value))} is negative or not finite;"
+            f"{e.path}: its emission {tuple(map(float, value))} is negative, not finite or beyond {BRIGHTEST:g};"
             " correct intensity, exposure and color"
         )
     return value

@@ -168,8 +168,11 @@ def _coordinates(source: Connection, ctx: Context) -> UVSource:
     """Follow ``st`` through UsdTransform2d nodes to a UsdPrimvarReader_float2."""
     node, name = source, "st"
     total = np.eye(3)  # for row vectors (u, v, 1)
+    passed = set()
     while True:
         given = read_connection(node.shader, name, ctx)
+        if given is not None and given.shader.GetPath() in passed:
+            raise StageError(f"{given.shader.GetPath()}: its input is its own output, through a circle; reconnect it")
         affine = tuple(float(x) for x in total[:, :2][[0, 0, 1, 1, 2, 2], [0, 1, 0, 1, 0, 1]])
         if given is None:
             value = node.value(name, (0.0, 0.0))
@@ -178,6 +181,7 @@ def _coordinates(source: Connection, ctx: Context) -> UVSource:
         if given.kind == "UsdTransform2d":
             total = _transform2d(given) @ total
             node, name = given, "in"
+            passed.add(given.shader.GetPath())
             continue
         if not given.kind.startswith("UsdPrimvarReader_float2"):
             ctx.notices.add(

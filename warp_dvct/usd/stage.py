@@ -81,15 +81,18 @@ def world_frame(stage: Usd.Stage) -> tuple[float, np.ndarray]:
     A z-up stage is turned by -90 degrees about x: (x, y, z) becomes (x, z, -y).
 
     Raises:
-        StageError: ``metersPerUnit`` is not positive.
+        StageError: ``metersPerUnit`` is not positive, or ``upAxis`` neither Y nor Z.
     """
     from pxr import UsdGeom
 
     metres = float(UsdGeom.GetStageMetersPerUnit(stage))
     if not (metres > 0.0 and np.isfinite(metres)):
         raise StageError(f"{name_of(stage)}: metersPerUnit is {metres}; it must be positive")
+    up = UsdGeom.GetStageUpAxis(stage)
+    if up not in (UsdGeom.Tokens.y, UsdGeom.Tokens.z):
+        raise StageError(f"{name_of(stage)}: upAxis is {up}; it must be Y or Z")
     frame = np.eye(4)
-    if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
+    if up == UsdGeom.Tokens.z:
         frame[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
     frame[:3, :3] *= metres
     return metres, frame
