@@ -25,7 +25,7 @@ from warp_dvct.scene import Scene
 from warp_dvct.settings import Settings, make_settings
 from warp_dvct.survey import survey
 
-SLOW = 1.3  # of the time that the machine's trial took at calibration: up to there rays alone make up for it
+SLOW = 1.4  # of the time that the machine's trial took at calibration: up to there rays alone make up for it
 PILOT_PIXELS = 5_000  # about, of the picture that tells what paths cost and how noisy they are
 PILOT_SAMPLES = 4
 # Mean FLIP over the mean difference in display values: 1.9 to 3.0 in four stages at 1, 4 and 16 samples a pixel.
@@ -51,7 +51,10 @@ def choose_settings(
     if method == "path-trace":
         return _path_trace(scene, launcher, width, height, seconds, max_error, fixed)
     start, compiled = time.perf_counter(), launcher.compile_seconds
+    probed = math.inf if seconds is None else try_machine(launcher)
     found = survey(scene, make_settings("balanced", fixed), launcher, width / height, has_plate=has_plate)
+    if seconds is not None:
+        probed = min(probed, try_machine(launcher))  # another process's turn may hide one of two, not both
     model = load_model("cpu" if launcher.device.is_cpu else launcher.device.alias)
     choice = choose(
         found,
@@ -63,20 +66,20 @@ def choose_settings(
         max_error=max_error,
         fixed=fixed,
         method=method,
-        slowness=1.0 if seconds is None else _slowness(launcher, model),
+        slowness=1.0 if seconds is None else _slowness(probed, model, launcher.threads),
     )
     if choice.pace is not None:
         choice.pace.spent = time.perf_counter() - start - (launcher.compile_seconds - compiled)
     return choice
 
 
-def _slowness(launcher: Launcher, model: CostModel) -> float:
-    """By how much longer than when ``model`` was measured this machine takes just now; 1 where that is little, for the
-    same scene and budget to give the same settings."""
-    expected = price({PROBE: {"tries": 1.0}}, model.clock_units(launcher.threads))
+def _slowness(probed: float, model: CostModel, threads: int) -> float:
+    """By how much longer than when ``model`` was measured this machine takes just now, told by what :func:`try_machine`
+    gave; 1 where that is little, for the same scene and budget to give the same settings."""
+    expected = price({PROBE: {"tries": 1.0}}, model.clock_units(threads))
     if expected <= 0.0:
         return 1.0  # measured before there was a trial
-    slowness = try_machine(launcher) / expected
+    slowness = probed / expected
     return min(slowness, SLOWNESS[1]) if slowness > SLOW else 1.0
 
 

@@ -54,7 +54,7 @@ def test_a_line_says_what_was_planned_and_settled():
 def test_a_tiny_room_keeps_a_budget(tmp_path, monkeypatch):
     """Predictions, times and errors are in the rows; a budget below the floor is said in its line."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
-    monkeypatch.setattr("warp_dvct.planning._slowness", lambda launcher, model: 1.0)
+    monkeypatch.setattr("warp_dvct.planning._slowness", lambda *args: 1.0)
     file = tmp_path / "rows.jsonl"
     words = ["budget", "--stage", "colour_bleeding", "--width", "48", "--spp", "16", "--cache", str(tmp_path)]
     flags = ["--budget", "0.001", "--budget", "1", "--set", "volume.resolution=64", "--out", str(file)]
