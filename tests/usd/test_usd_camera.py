@@ -140,3 +140,10 @@ def test_plate_of_the_camera_follows_time_and_is_overridden(build, tmp_path):
     plate.Set(Sdf.AssetPath("lost.png"), 3.0)
     with pytest.raises(StageError, match=r"/World/Camera.dvct:plate:file: plate 'lost.png' does not exist"):
         build.read(time=3.0)
+
+
+@pytest.mark.parametrize("name", ["horizontalApertureOffset", "verticalApertureOffset"])
+def test_offsets_have_to_be_numbers(build, name):
+    build.stage.GetPrimAtPath("/World/Camera").GetAttribute(name).Set(float("nan"))
+    with pytest.raises(StageError, match=f"/World/Camera: {name} is nan; give a finite number"):
+        build.read()

@@ -309,6 +309,51 @@ def test_shaders_of_other_kinds_fall_back_to_the_display_colour(build):
     assert "'ND_standard_surface_surfaceshader' is not UsdPreviewSurface" in scene.notices[0].message
 
 
+@pytest.mark.parametrize(
+    ("name", "kind", "value", "told"),
+    [
+        ("diffuseColor", "String", "red", "diffuseColor is 'red', which is no colour; the default is used"),
+        ("diffuseColor", "Float", 0.5, "diffuseColor is 0.5, which is no colour"),
+        ("diffuseColor", "Color3f", (float("nan"), 0, 0), "which is no colour"),
+        ("roughness", "Float", float("nan"), "roughness is nan, which is no finite number"),
+        ("metallic", "Float", float("inf"), "metallic is inf, which is no finite number"),
+        ("opacity", "Token", "half", "opacity is not modelled"),
+    ],
+)
+def test_inputs_that_are_no_number_take_their_default_and_are_listed(build, name, kind, value, told):
+    """A NaN would spread over the picture, a wrong type end in a traceback."""
+    shader = build.material(bind=build.quad())
+    shader.CreateInput(name, getattr(Sdf.ValueTypeNames, kind)).Set(value)
+    scene = build.read()
+    (notice,) = scene.notices
+    assert told in str(notice)
+    made = material_of(scene)[1]
+    assert (made.base_color, made.roughness, made.metallic) == ((0.18, 0.18, 0.18), 0.5, 0.0)
+
+
+def test_textures_and_transforms_with_nan_are_refused(build, tmp_path):
+    pixels = np.full((2, 2, 3), np.nan, np.float32)
+    texture, _ = textured(build, write_image(tmp_path / "c.exr", pixels, "float"), "diffuseColor")
+    with pytest.raises(StageError, match=r"/World/Looks/Mat: the texture of diffuseColor, '.*c.exr', has NaN"):
+        build.read()
+    texture.GetInput("file").Set(Sdf.AssetPath(str(write_image(tmp_path / "d.png", np.full((2, 2, 3), 51)))))
+    turn = UsdShade.Shader.Define(build.stage, "/World/Looks/Mat/Turn")
+    turn.CreateIdAttr("UsdTransform2d")
+    turn.CreateInput("rotation", Sdf.ValueTypeNames.Float).Set(float("nan"))
+    turn.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+    texture.GetInput("st").ConnectToSource(turn.ConnectableAPI(), "result")
+    reader = UsdShade.Shader.Get(build.stage, "/World/Looks/Mat/diffuseColorReader")
+    turn.CreateInput("in", Sdf.ValueTypeNames.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
+    with pytest.raises(StageError, match="/World/Looks/Mat/Turn: scale, rotation or translation is NaN"):
+        build.read()
+
+
+def test_an_unknown_wrap_mode_repeats_and_is_listed(build, tmp_path):
+    textured(build, write_image(tmp_path / "c.png", np.full((2, 2, 3), 51)), "diffuseColor", wrapS="sideways")
+    (notice,) = build.read().notices
+    assert "wrapS is 'sideways', which is no wrap mode; repeated" in str(notice)
+
+
 def test_a_binding_to_nothing_is_listed_where_it_is_authored(build):
     """As after a rename: without a word the object would be grey."""
     build.quad("/World/Group/Mesh").CreateDisplayColorAttr([(0.2, 0.4, 0.6)])

@@ -73,6 +73,9 @@ def read_camera(prim: Usd.Prim, ctx: Context) -> Camera:
     focal, width, height = positive("focalLength"), positive("horizontalAperture"), positive("verticalAperture")
     across = float(camera.GetHorizontalApertureOffsetAttr().Get(ctx.time))
     up = float(camera.GetVerticalApertureOffsetAttr().Get(ctx.time))
+    for name, value in (("horizontalApertureOffset", across), ("verticalApertureOffset", up)):
+        if not np.isfinite(value):
+            raise StageError(f"{path}: {name} is {value}; give a finite number")
     near, far = _clipping(camera, ctx)
     _note_camera(camera, ctx)
     return Camera(

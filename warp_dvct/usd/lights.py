@@ -116,6 +116,8 @@ def _shaping(e: _Emitter) -> dict[str, float]:
     softness = float(np.clip(e.get("inputs:shaping:cone:softness", 0.0), 0.0, 1.0))
     if not (np.isfinite(angle) and angle > 0.0):
         raise StageError(f"{e.path}: shaping:cone:angle is {np.degrees(angle)}; it must be positive")
+    if np.isnan(softness):
+        raise StageError(f"{e.path}: shaping:cone:softness is nan; give 0 to 1")
     return {"cone_angle": float(min(angle, np.pi)), "cone_softness": softness}
 
 

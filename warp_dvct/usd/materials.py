@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warp_dvct.errors import StageError
 from warp_dvct.scene import Material, Texture
 from warp_dvct.usd.context import Context, shared_path
 from warp_dvct.usd.shading import Connection, UVSource, read_connection, read_texture_node, shader_id
@@ -157,6 +158,8 @@ class Materials:
         node = read_texture_node(source, self._ctx, self._images)
         if node.key not in self._texture_index and node.texture is not None:
             pixels = node.texture.pixels
+            if np.isnan(pixels).any():
+                raise StageError(f"{path}: the texture of {name}, '{node.texture.name}', has NaN values; repair it")
             if pixels.size and (pixels.min() < 0.0 or pixels.max() > 1.0 + 1e-6):
                 self._ctx.notices.add(path, f"the texture of {name} leaves [0, 1] and is clamped")
             texture = replace(node.texture, pixels=np.ascontiguousarray(np.clip(pixels, 0.0, 1.0), np.float32))
@@ -181,7 +184,10 @@ class Materials:
         source = read_connection(shader, name, self._ctx)
         if source is None:
             value = _input_value(shader, name, self._ctx)
-            return default if value is None else value
+            if value is None or _is_like(value, default):
+                return default if value is None else value
+            self._ctx.notices.add(path, f"{name} is {value!r}, which is no {_word(default)}; the default is used")
+            return default
         if source.kind == "UsdUVTexture":
             node = read_texture_node(source, self._ctx, self._images)
             mean = node.fallback if node.texture is None else node.texture.pixels.mean((0, 1), dtype=np.float64)
@@ -195,7 +201,7 @@ class Materials:
             self._ctx.notices.add(path, f"{name} is not modelled{INSTEAD.get(name, '')}")
             return
         value = _input_value(shader, name, self._ctx)
-        if value is not None and not np.allclose(np.array(value, dtype=float), neutral):
+        if value is not None and not (_is_like(value, neutral) and np.allclose(np.array(value, dtype=float), neutral)):
             self._ctx.notices.add(path, f"{name} is not modelled{INSTEAD.get(name, '')}")
 
     def _rgb(self, value: Any, path: str, name: str) -> tuple[float, float, float]:
@@ -204,6 +210,19 @@ class Materials:
             self._ctx.notices.add(path, f"{name} {tuple(map(float, rgb))} leaves [0, 1] and is clamped")
             rgb = np.clip(np.nan_to_num(rgb), 0.0, 1.0)
         return float(rgb[0]), float(rgb[1]), float(rgb[2])
+
+
+def _is_like(value: Any, default: Any) -> bool:
+    """Whether an input's value can stand for ``default``: as many finite numbers."""
+    try:
+        numbers = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return False
+    return numbers.shape == np.shape(default) and bool(np.isfinite(numbers).all())
+
+
+def _word(default: Any) -> str:
+    return "colour" if isinstance(default, tuple) else "finite number"
 
 
 def _input_value(shader: UsdShade.Shader, name: str, ctx: Context) -> Any:

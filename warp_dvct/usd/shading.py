@@ -147,7 +147,10 @@ def _color_space(source: Connection, attribute: Usd.Attribute) -> str:
 
 
 def _wrap(source: Connection, name: str) -> Wrap:
-    return WRAPS.get(str(source.value(name, "useMetadata")), Wrap.REPEAT)
+    mode = str(source.value(name, "useMetadata"))
+    if mode not in (*WRAPS, "useMetadata"):
+        source.ctx.notices.add(source.shader.GetPath(), f"{name} is '{mode}', which is no wrap mode; repeated")
+    return WRAPS.get(mode, Wrap.REPEAT)
 
 
 def _channels(pixels: np.ndarray, output: str, scale: tuple, bias: tuple) -> np.ndarray:
@@ -201,6 +204,8 @@ def _transform2d(node: Connection) -> np.ndarray:
     m = np.eye(3)
     m[:2, :2] = np.diag([float(scale[0]), float(scale[1])]) @ turn
     m[2, :2] = [float(move[0]), float(move[1])]
+    if not np.isfinite(m).all():
+        raise StageError(f"{node.shader.GetPath()}: scale, rotation or translation is NaN or infinite; correct it")
     return m
 
 
