@@ -267,6 +267,15 @@ def test_what_is_given_stays_and_what_is_not_needed_is_left_out(surveys):
     json.dumps(choice.to_dict())
 
 
+def test_cones_are_said_to_be_unknown(surveys):
+    """Their number is no ladder's: rays that nobody traces do not fill a budget."""
+    choice = chosen(surveys, seconds=20.0, fixed={"gather": "cones", "shadows": "cone"})
+    assert choice.settings.gather_rays == make_settings().gather_rays
+    assert "gather=cones shadows=cone: what cones take is not in the model" in choice.describe()
+    assert "cone" not in chosen(surveys, seconds=20.0).describe()
+    assert choice.pace is None
+
+
 @pytest.mark.parametrize("budget", [0.0, -1.0, math.nan, math.inf])
 def test_what_is_no_budget(surveys, budget):
     for name in ("seconds", "max_error"):

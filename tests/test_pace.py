@@ -12,7 +12,7 @@ from known_costs import made_model
 from warp_dvct import Relighter
 from warp_dvct.budget import Choice, choose
 from warp_dvct.cost import PROBE, price
-from warp_dvct.pace import LATER, Pace, try_machine, with_rays
+from warp_dvct.pace import BELIEVED, LATER, Pace, try_machine, with_rays
 from warp_dvct.settings import Settings, make_settings
 from warp_dvct.survey import Survey, survey
 from warp_dvct.usd.read import read_stage
@@ -109,12 +109,12 @@ def test_a_slow_machine_is_planned_for(surveys):
     assert price(slow.pace.count(slow.settings), slow.pace.units) == pytest.approx(slow.seconds, rel=0.1)
 
 
-def test_half_of_a_sudden_speed_is_believed(surveys):
-    usual, slow = (chosen(surveys, seconds=2.0, slowness=slowness).pace for slowness in (1.0, 4.0))
-    assert usual._believed(0.6) == pytest.approx(0.6)
-    assert slow._believed(0.6) == pytest.approx(0.6)
-    assert slow._believed(0.25) == pytest.approx(0.5)  # as fast as calibrated: twice as fast as that is planned with
-    assert slow._believed(0.2) == pytest.approx(0.4)  # faster still: in proportion
+def test_a_part_of_a_sudden_speed_is_believed(surveys):
+    usual, slow = (chosen(surveys, seconds=2.0, slowness=slowness).pace for slowness in (1.0, 2.0))
+    assert usual._believed(0.7) == slow._believed(0.7) == pytest.approx(0.7)
+    assert slow._believed(0.5) == pytest.approx(2.0**-BELIEVED)  # as fast as calibrated: not quite twice as fast
+    assert slow._believed(0.4) == pytest.approx(0.8 * 2.0**-BELIEVED)  # faster still: in proportion
+    assert usual._believed(0.1) == pytest.approx(0.4)
     assert slow._believed(9.0) == usual._believed(9.0) == pytest.approx(4.0)
 
 

@@ -25,6 +25,7 @@ AIM = 0.95  # of the budget, for the settings' prediction; what is left when ray
 VOXELS_PER_FEATURE = 2.0  # across the smallest extent of an object, for its light not to pass through it
 NEARLY = 0.9  # of what is aimed at: a choice that takes less has nothing more to gain
 SHOWS = 0.005  # of an error: what doubling the rays has to take off it to be worth their time
+CONES = ("gather", "shadows", "glossy")  # settings that may ask for cones
 MOST = {"gather.rays": 65536, "vpls.count": 4096}
 
 
@@ -148,7 +149,9 @@ class _Chooser:
         self.ladders = [
             self._required(x)
             for x in LADDERS_OF[method]
-            if matters(x.knob, survey) and not any(k in fixed for k in x.settings(x.values[0]))
+            if matters(x.knob, survey)
+            and not any(k in fixed for k in x.settings(x.values[0]))
+            and not (self.base.gather == "cones" and x.knob in (RAYS, DETAIL))
         ]
         self.planning = {"survey": count_survey(survey), CHOOSING: {"frame": 1.0}}
         units = model.clock_units(threads)
@@ -349,6 +352,9 @@ class _Chooser:
                 f"the smallest object extends {survey.feature * settings.volume_resolution:.1f} voxels where"
                 f" {VOXELS_PER_FEATURE:g} are needed: light leaks through it; --set volume.resolution={self.required}"
             )
+        cones = [f"{name}={getattr(settings, name)}" for name in CONES if getattr(settings, name).startswith("cone")]
+        if cones and self.method == "delta-cones":
+            lines.append(f"{' '.join(cones)}: what cones take is not in the model, they count as rays")
         if self.slowness > 1.0:
             lines.append(f"the machine takes {self.slowness:.1f} times as long just now as when it was calibrated")
         if self.model.shipped:

@@ -37,6 +37,7 @@ MOST_TRIED = 128  # rays a point of a trial: more take in proportion
 PROBE = 4096, 200  # elements and steps of the machine's trial: 5 ms on one thread
 SLOWNESS = (0.4, 4.0)  # measured over predicted seconds that are believed
 RAYS_SET = ("gather.rays", "gather.object_rays")  # what is settled
+BELIEVED = 0.75  # of the logarithm of a slow machine's sudden speed
 BUSY = 0.9  # of the largest gain by threads: passes with less leave threads idle
 LATER = ("direct", "specular", "resolve", "composite", "gbuffer", REST)  # passes that do not run before
 
@@ -130,9 +131,9 @@ class Pace:
 
     def _believed(self, slowness: float) -> float:
         """Measured over predicted seconds, within bounds. A machine that was slow when the plan was made, and no longer
-        is, may soon be slow again: of such a change half is believed."""
-        half = self.slowness**-0.5 * min(1.0, slowness * self.slowness)
-        return float(np.clip(max(slowness, half), *SLOWNESS))
+        is, may soon be slow again: a part of such a change is believed."""
+        least = self.slowness**-BELIEVED * min(1.0, slowness * self.slowness)
+        return float(np.clip(max(slowness, least), *SLOWNESS))
 
     def _stall(self, launcher: Launcher, done: Mapping[str, Counts]) -> float:
         """By how much longer threads took by the clock for their processor time than when they were calibrated, in the
