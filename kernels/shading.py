@@ -30,6 +30,7 @@ from warp_dvct.kernels.volume import Volume
 wp.set_module_options({"enable_backward": False})
 
 UNLIT_MARGIN = wp.constant(1.0e-4)  # of a distance or cosine: keeps rounding from culling a light at the horizon
+ON_AXIS = wp.constant(1.0e-4)  # squared sine of an angle whose rounding is far below BOX_MARGIN
 BOX_MARGIN = wp.constant(1.0e-5)  # of the lengths compared: keeps rounding from culling what a box barely meets
 SPHERE_MARGIN = wp.constant(1.002)  # of a squared radius, to the same end
 SHADOW_END = wp.constant(0.9999)  # of the way to the light: a surface that the light lies on does not shadow it
@@ -135,8 +136,12 @@ def may_shadow(lights: Lights, i: int, position: wp.vec3, direct: Direct) -> boo
         sine2 = bound * bound / far2
     elif lights.cap[i] >= 1.0:
         return True
-    # All ways to the light are within a cone; this plane touches it on the side of the box.
-    across = wp.normalize(toward - axis * wp.dot(toward, axis))
+    # All ways to the light are within a cone; this plane touches it on the side of the box. Where the box lies on the
+    # cone's axis no side is its own: what is left of the difference is rounding, and may point anywhere.
+    across = toward - axis * wp.dot(toward, axis)
+    if wp.length_sq(across) <= ON_AXIS * wp.length_sq(toward):
+        return True
+    across = wp.normalize(across)
     return not beyond(across * wp.sqrt(1.0 - sine2) - axis * wp.sqrt(sine2), toward, direct.extent)
 
 
