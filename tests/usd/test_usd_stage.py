@@ -83,6 +83,21 @@ def test_transforms_that_are_ordered_and_not_there_are_listed(build):
     ]
 
 
+@pytest.mark.parametrize(("half", "listed"), [(1e6, False), (1e7, True)])
+def test_a_ground_too_large_for_rays_is_listed(build, half, listed):
+    """Its picture would be noise."""
+    build.quad("/World/Ball")
+    ground = build.mesh([(-half, 0, half), (half, 0, half), (half, 0, -half), (-half, 0, -half)], [[0, 1, 2, 3]])
+    build.tag(ground, "real")
+    told = [str(n) for n in build.read().notices]
+    assert (
+        told
+        == ["/World/Mesh: is 1e+07 times as large as all synthetic objects: rays miss parts of it; cut it smaller"][
+            : int(listed)
+        ]
+    )
+
+
 def test_a_notice_is_one_line(build):
     """Composition errors of USD span several."""
     build.quad().GetPrim().GetReferences().AddInternalReference("/World")

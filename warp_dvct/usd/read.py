@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_dvct.errors import StageError
-from warp_dvct.scene import Camera, Light, Mesh, Notice, PointCloud, Scene
+from warp_dvct.scene import Camera, Light, Mesh, Notice, PointCloud, Role, Scene
 from warp_dvct.usd.camera import choose_camera, read_camera, read_plate
 from warp_dvct.usd.collect import Collection, Collector, Placed
 from warp_dvct.usd.context import Context, shared_path
@@ -27,6 +27,8 @@ from warp_dvct.usd.textures import ImageCache
 
 if TYPE_CHECKING:
     from pxr import Usd
+
+VAST = 8e6  # times the objects' size: pictures of a ground of 6e6 are still right
 
 
 def read_stage(
@@ -105,6 +107,7 @@ def _assemble(ctx: Context, camera: Camera, plate: str | None, found: Collection
     """Read everything that the walk found."""
     materials = Materials(ctx, images)
     meshes, clouds = _GeometryBuilder(ctx, materials).build(found.geometry)
+    _note_vast(meshes, ctx)
     lights: list[Light] = []
     for placed in found.lights:
         lights += read_lights(placed, ctx, images)
@@ -120,6 +123,23 @@ def _assemble(ctx: Context, camera: Camera, plate: str | None, found: Collection
         notices=ctx.notices.all(),
         point_clouds=tuple(clouds),
     )
+
+
+def _note_vast(meshes: Sequence[Mesh], ctx: Context) -> None:
+    """List meshes so much larger than the synthetic objects that float32 rays miss parts of them."""
+    bounds = [(m.points.min(0), m.points.max(0)) for m in meshes]
+    small = [size for m, size in zip(meshes, bounds, strict=True) if m.role == Role.SYNTHETIC]
+    if not small:
+        return
+    low, high = np.min([b[0] for b in small], axis=0), np.max([b[1] for b in small], axis=0)
+    edge = float((high - low).max())
+    for mesh, (least, most) in zip(meshes, bounds, strict=True):
+        times = float((most - least).max()) / max(edge, 1e-300)
+        if times > VAST:
+            ctx.notices.add(
+                mesh.path,
+                f"is {times:.1g} times as large as all synthetic objects: rays miss parts of it; cut it smaller",
+            )
 
 
 def _list(notices: Sequence[Notice]) -> str:
