@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdRender
 
 from warp_dvct.errors import FileError, StageError
 
@@ -147,3 +147,48 @@ def test_offsets_have_to_be_numbers(build, name):
     build.stage.GetPrimAtPath("/World/Camera").GetAttribute(name).Set(float("nan"))
     with pytest.raises(StageError, match=f"/World/Camera: {name} is nan; give a finite number"):
         build.read()
+
+
+def settings_for(build, size, policy=None, on_product=True):
+    """Render settings with one product of the stage's camera."""
+    settings = UsdRender.Settings.Define(build.stage, "/Render/Settings")
+    product = UsdRender.Product.Define(build.stage, "/Render/Product")
+    build.stage.SetMetadata("renderSettingsPrimPath", "/Render/Settings")
+    settings.CreateProductsRel().SetTargets([product.GetPath()])
+    product.CreateCameraRel().SetTargets(["/World/Camera"])
+    product.CreateResolutionAttr(Gf.Vec2i(*size))
+    if policy:
+        (product if on_product else settings).CreateAspectRatioConformPolicyAttr(policy)
+
+
+@pytest.mark.parametrize("on_product", [True, False])
+@pytest.mark.parametrize(
+    ("size", "policy", "width", "height"),
+    [
+        ((1200, 800), None, 0.6, 0.4),  # the camera's own shape
+        ((800, 800), None, 0.6, 0.6),
+        ((1600, 800), "expandAperture", 0.8, 0.4),
+        ((800, 800), "cropAperture", 0.4, 0.4),
+        ((1600, 800), "cropAperture", 0.6, 0.3),
+        ((800, 800), "adjustApertureWidth", 0.4, 0.4),
+        ((1600, 800), "adjustApertureHeight", 0.6, 0.3),
+    ],
+)
+def test_the_aperture_conforms_to_the_render_products_shape(build, size, policy, width, height, on_product):
+    """About its middle, which offsets move; by default it is expanded, so that nothing is cut off."""
+    camera = UsdGeom.Camera.Get(build.stage, "/World/Camera")
+    camera.GetFocalLengthAttr().Set(40.0)
+    camera.GetHorizontalApertureAttr().Set(24.0)
+    camera.GetVerticalApertureAttr().Set(16.0)
+    camera.GetHorizontalApertureOffsetAttr().Set(4.0)
+    settings_for(build, size, policy, on_product)
+    seen = build.read().camera
+    assert (seen.tan_left, seen.tan_right) == pytest.approx((0.1 - width / 2, 0.1 + width / 2))
+    assert (seen.tan_bottom, seen.tan_top) == pytest.approx((-height / 2, height / 2))
+    assert build.read().notices == ()
+
+
+def test_pixels_that_are_not_square_are_listed(build):
+    settings_for(build, (800, 800), "adjustPixelAspectRatio")
+    (notice,) = build.read().notices
+    assert str(notice).startswith("/Render/Product: adjustPixelAspectRatio is not modelled")

@@ -21,6 +21,7 @@ from warp_dvct.usd.materials import Look, Materials
 from warp_dvct.usd.points import LocalPoints, placed_radii, read_points
 from warp_dvct.usd.primvars import corner_values
 from warp_dvct.usd.refine import refinement_levels
+from warp_dvct.usd.render import conform
 from warp_dvct.usd.roles import Roles, require_roles
 from warp_dvct.usd.stage import name_of, note_composition_errors, open_stage, quiet_diagnostics, world_frame
 from warp_dvct.usd.textures import ImageCache
@@ -87,7 +88,7 @@ def read_stage(
             if not allow_empty_roles:
                 require_roles(stage, found.defined)
             if eye is not None:
-                view, plate = read_camera(eye, ctx), read_plate(eye, ctx, plate)
+                view, plate = conform(read_camera(eye, ctx), ctx), read_plate(eye, ctx, plate)
             assert view is not None
             if not (found.lights_defined or allow_no_light):
                 raise StageError(f"{name_of(stage)} has no light; add a UsdLux light")
