@@ -381,12 +381,44 @@ def inverse_at(ism: Ism, start: int, place: Place) -> float:
 
 
 @wp.func
+def open_share(ism: Ism, start: int, place: Place) -> float:
+    """Share of a point's light that passes what a map shows. Of four texels, those that show nothing count by their
+    area, as edges and holes do; the others as in ``inverse_at``."""
+    x = place.x - 0.5
+    y = place.y - 0.5
+    x0 = int(wp.floor(x))
+    y0 = int(wp.floor(y))
+    fx = x - float(x0)
+    fy = y - float(y0)
+    shown = float(0.0)
+    inverse = float(0.0)
+    low = float(0.0)
+    high = float(0.0)
+    for k in range(4):
+        dx = k % 2
+        dy = k / 2
+        value = map_texel(ism, start, x0 + dx, y0 + dy)
+        if value > 0.0:
+            weight = wp.where(dx == 1, fx, 1.0 - fx) * wp.where(dy == 1, fy, 1.0 - fy)
+            shown += weight
+            inverse += value * weight
+            low = wp.where(high > 0.0, wp.min(low, value), value)
+            high = wp.max(high, value)
+    if low >= high * SAME_SURFACE:
+        low = inverse / wp.max(shown, 1.0e-12)
+    return wp.where(low > place.limit, 1.0 - shown, 1.0)
+
+
+@wp.func
 def map_sight(vpls: Vpls, k: int, sight: Sight, position: wp.vec3) -> wp.vec2:
-    """1 or 0: whether VPL k sees a point past real surfaces (x), and past synthetic ones (y), by its two maps."""
+    """How far VPL k sees a point past real surfaces (x), and past synthetic ones (y), by its two maps: 1 or 0; a share
+    where the VPL is on the sky, whose maps have no horizon at which surfaces would hide themselves."""
     ism = sight.ism
     place = place_in_map(vpls, k, ism, position)
     if place.limit <= 0.0:
         return wp.vec2(1.0, 1.0)
+    if vpls.kind[k] == SKY and sight.single == 0:
+        return wp.vec2(open_share(ism, 2 * k * ism.stride, place), open_share(ism, (2 * k + 1) * ism.stride, place))
     real = inverse_at(ism, 2 * k * ism.stride, place)
     synthetic = inverse_at(ism, (2 * k + 1) * ism.stride, place)
     s_real = wp.where(real > place.limit, 0.0, 1.0)

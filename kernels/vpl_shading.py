@@ -105,7 +105,7 @@ def vpl_irradiance(
         open = ray_sight(geo, sight, origin, toward.direction, toward.distance * RAY_END, ask_synthetic, need)
     else:
         open = map_sight(vpls, k, sight, origin)
-    if need == CHANGE and open[1] > 0.0:
+    if need == CHANGE and open[1] == 1.0:
         return out
     if in_before:
         out.before = light * open[0]
@@ -430,7 +430,8 @@ def _compare_sight(
         for k in range(vpls.count):
             toward = toward_vpl(vpls, k, s, origin)
             if toward.form > 0.0:
-                a = map_sight(vpls, k, maps, origin)
+                share = map_sight(vpls, k, maps, origin)
+                a = wp.vec2(wp.round(share[0]), wp.round(share[1]))
                 b = ray_sight(geo, rays, origin, toward.direction, toward.distance * RAY_END, 1, ALL)
                 x = wp.vec2(a[0] * float(vpls.real[k]), wp.min(a[0], a[1]) * float(1 - vpls.hidden[k]))
                 y = wp.vec2(b[0] * float(vpls.real[k]), wp.min(b[0], b[1]) * float(1 - vpls.hidden[k]))

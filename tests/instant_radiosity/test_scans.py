@@ -61,7 +61,7 @@ def test_a_synthetic_scan_shades_the_ground_by_the_share_of_sky_that_it_covers()
     """A disc of radius R at height h takes R² / (R² + h²) of the light of an even sky."""
     left = openness(render(stage_with_a_scanned_disc(4000)))
     covered = 0.25 / (0.25 + 0.09)
-    assert abs(left - (1 - covered)) < 0.075  # blurred rims leave 0.32 of 0.26, give or take 0.005 by the seed
+    assert abs(left - (1 - covered)) < 0.02  # 0.276 of 0.265, give or take 0.005 by the seed; exact rays find 0.278
     assert openness(render(stage_with_a_scanned_disc(0))) > 0.99
 
 
@@ -71,4 +71,4 @@ def test_a_real_scan_shades_both_pictures():
     assert openness(real) > 0.97
     middle = slice(15, 18)
     ratio = real.plate[middle, middle].mean() / without.plate[middle, middle].mean()
-    assert abs(ratio - 0.09 / 0.34) < 0.06
+    assert abs(ratio - 0.09 / 0.34) < 0.04
