@@ -191,44 +191,23 @@ def _copy_points(first: int, source: Points, points_out: Points):
     points_out.footprint[i] = source.footprint[i]
 
 
-@wp.func
-def meets_box(origin: wp.vec3, direction: wp.vec3, center: wp.vec3, extent: wp.vec3) -> bool:
-    """Whether a line passes a box, given by its middle and half its edges."""
-    toward = center - origin
-    enter = float(-FAR)
-    leave = float(FAR)
-    for axis in range(3):
-        # No component is 0: the slab of an axis across the line then holds all of it, or none.
-        slope = direction[axis] + wp.where(direction[axis] < 0.0, -1.0e-12, 1.0e-12)
-        middle = toward[axis] / slope
-        half = extent[axis] / wp.abs(slope)
-        enter = wp.max(enter, middle - half)
-        leave = wp.min(leave, middle + half)
-    return enter <= leave
-
-
 @wp.kernel
 def _see_synthetic(
     first: int,
     geo: Geometry,
     mats: Materials,
     cam: CameraFrame,
-    center: wp.vec3,
-    extent: wp.vec3,
     reach_in: wp.array(dtype=wp.float32),
     width: int,
     height: int,
     points_out: Points,
 ):
     """Put synthetic surfaces in front of what ``points_out`` holds of the real scene, once those of the frame before
-    are taken out; all of them lie in the box of half edges ``extent`` around ``center``, a negative one if there are
-    none."""
+    are taken out."""
     i = first + wp.tid()
     ray = camera_ray(cam, float(i % width) + 0.5, float(i / width) + 0.5, width, height)
     spread = (cam.tan_right - cam.tan_left) / float(width)
-    hit = Hit()
-    if extent[0] > 0.0 and meets_box(ray.origin, ray.direction, center, extent):
-        hit = trace_synthetic(geo, ray.origin, ray.direction, reach_in[i])
+    hit = trace_synthetic(geo, ray.origin, ray.direction, reach_in[i])
     if hit.found == 0 and points_out.role[i] == SYNTHETIC:
         hit = trace_real(geo, ray.origin, ray.direction, ray.t_max)
         store_hit(geo, mats, hit, ray.origin, ray.direction, spread, i, points_out)

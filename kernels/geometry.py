@@ -24,6 +24,8 @@ class Geometry:
     has_real: int
     has_synthetic: int
     synthetic_first: int
+    center: wp.vec3  # middle of a box that holds the synthetic triangles
+    extent: wp.vec3  # half its edges
     corner_normals: wp.array(dtype=wp.vec3)  # zero where the triangle is faceted
     corner_uvs: wp.array(dtype=wp.vec2)
     corner_colors: wp.array(dtype=wp.vec3)
@@ -125,10 +127,28 @@ def trace_real(geo: Geometry, origin: wp.vec3, direction: wp.vec3, t_max: float)
 
 
 @wp.func
+def may_meet_synthetic(geo: Geometry, origin: wp.vec3, direction: wp.vec3, t_max: float) -> bool:
+    """Whether a ray passes the box around the synthetic triangles; most do not, and asking their tree costs more."""
+    if geo.has_synthetic == 0:
+        return False
+    toward = geo.center - origin
+    enter = float(0.0)
+    leave = float(t_max)
+    for axis in range(3):
+        # No component is 0: the slab of an axis across the ray then holds all of it, or none.
+        inverse = 1.0 / (direction[axis] + wp.where(direction[axis] < 0.0, -1.0e-12, 1.0e-12))
+        middle = toward[axis] * inverse
+        half = geo.extent[axis] * wp.abs(inverse)
+        enter = wp.max(enter, middle - half)
+        leave = wp.min(leave, middle + half)
+    return enter <= leave
+
+
+@wp.func
 def trace_synthetic(geo: Geometry, origin: wp.vec3, direction: wp.vec3, t_max: float) -> Hit:
     """Nearest synthetic surface closer than ``t_max``."""
     hit = no_hit(t_max)
-    if geo.has_synthetic != 0:
+    if may_meet_synthetic(geo, origin, direction, t_max):
         query = wp.mesh_query_ray(geo.synthetic, origin, direction, t_max)
         if query.result:
             hit.found = 1
@@ -161,7 +181,7 @@ def occluded_by_real(geo: Geometry, origin: wp.vec3, direction: wp.vec3, t_max: 
 @wp.func
 def occluded_by_synthetic(geo: Geometry, origin: wp.vec3, direction: wp.vec3, t_max: float) -> bool:
     """Whether a synthetic surface lies closer than ``t_max``."""
-    if geo.has_synthetic == 0:
+    if not may_meet_synthetic(geo, origin, direction, t_max):
         return False
     return wp.mesh_query_ray_anyhit(geo.synthetic, origin, direction, t_max)
 

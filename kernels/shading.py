@@ -32,7 +32,6 @@ wp.set_module_options({"enable_backward": False})
 UNLIT_MARGIN = wp.constant(1.0e-4)  # of a distance or cosine: keeps rounding from culling a light at the horizon
 ON_AXIS = wp.constant(1.0e-4)  # squared sine of an angle whose rounding is far below BOX_MARGIN
 BOX_MARGIN = wp.constant(1.0e-5)  # of the lengths compared: keeps rounding from culling what a box barely meets
-SPHERE_MARGIN = wp.constant(1.002)  # of a squared radius, to the same end
 SHADOW_END = wp.constant(0.9999)  # of the way to the light: a surface that the light lies on does not shadow it
 
 
@@ -47,8 +46,6 @@ class Direct:
     alpha_max: wp.float32  # roughest GGX alpha that the specular pass treats
     with_before: wp.int32  # 1: also the radiance before, on every real point (it becomes the plate)
     seed: wp.int32
-    center: wp.vec3  # box around the synthetic objects: its middle
-    extent: wp.vec3  # and half its edges
 
 
 @wp.func
@@ -105,13 +102,13 @@ def beyond_sides(lights: Lights, i: int, to_light: wp.vec3, toward: wp.vec3, ext
 
 
 @wp.func
-def may_shadow(lights: Lights, i: int, position: wp.vec3, direct: Direct) -> bool:
+def may_shadow(geo: Geometry, lights: Lights, i: int, position: wp.vec3) -> bool:
     """Whether the box around the synthetic objects may meet a segment from a point to a light.
 
     False only where a plane parts the box from the hull of point and light: one across the way to the box, a side of
     the pyramid over a planar light, or a face of the box.
     """
-    toward = direct.center - position
+    toward = geo.center - position
     axis = -lights.direction[i]
     sine2 = lights.cap[i] * (2.0 - lights.cap[i])
     if lights.kind[i] != DISTANT:
@@ -123,14 +120,14 @@ def may_shadow(lights: Lights, i: int, position: wp.vec3, direct: Direct) -> boo
             return True
         size = size + wp.vec3(lights.radius[i], lights.radius[i], lights.radius[i])
         gap = wp.max(wp.vec3(0.0, 0.0, 0.0), to_light + size)
-        room = direct.extent + BOX_MARGIN * (wp.abs(toward) + wp.abs(to_light) + size + direct.extent)
+        room = geo.extent + BOX_MARGIN * (wp.abs(toward) + wp.abs(to_light) + size + geo.extent)
         if toward[0] - room[0] > gap[0] or toward[1] - room[1] > gap[1] or toward[2] - room[2] > gap[2]:
             return False
         gap = wp.min(wp.vec3(0.0, 0.0, 0.0), to_light - size)
         if toward[0] + room[0] < gap[0] or toward[1] + room[1] < gap[1] or toward[2] + room[2] < gap[2]:
             return False
         if lights.kind[i] == RECT or lights.kind[i] == DISK:
-            if beyond_sides(lights, i, to_light, toward, direct.extent):
+            if beyond_sides(lights, i, to_light, toward, geo.extent):
                 return False
         axis = to_light / wp.sqrt(far2)
         sine2 = bound * bound / far2
@@ -142,7 +139,7 @@ def may_shadow(lights: Lights, i: int, position: wp.vec3, direct: Direct) -> boo
     if wp.length_sq(across) <= ON_AXIS * wp.length_sq(toward):
         return True
     across = wp.normalize(across)
-    return not beyond(across * wp.sqrt(1.0 - sine2) - axis * wp.sqrt(sine2), toward, direct.extent)
+    return not beyond(across * wp.sqrt(1.0 - sine2) - axis * wp.sqrt(sine2), toward, geo.extent)
 
 
 @wp.func
@@ -201,14 +198,6 @@ def unlit(lights: Lights, k: int, position: wp.vec3, normal: wp.vec3) -> bool:
     return planar and wp.dot(to_light, lights.direction[k]) > margin
 
 
-@wp.func
-def meets_objects(origin: wp.vec3, direction: wp.vec3, reach: float, direct: Direct) -> bool:
-    """Whether a ray passes the sphere around the synthetic objects: much cheaper to ask than their triangles."""
-    to_center = direct.center - origin
-    along = wp.clamp(wp.dot(to_center, direction), 0.0, reach)
-    return wp.length_sq(to_center - direction * along) <= SPHERE_MARGIN * wp.length_sq(direct.extent)
-
-
 @wp.struct
 class Draw:
     """Which light samples a point takes: numbers ``first`` to ``first + samples`` of the picture's sequence."""
@@ -247,9 +236,8 @@ def untouched(s: Surface, wo: wp.vec3, draw: Draw, geo: Geometry, lights: Lights
             lit = wp.max(f[0], wp.max(f[1], f[2])) > 0.0
         origin = spawn_point(s, light.direction)
         reach = light.distance * SHADOW_END
-        if meets_objects(origin, light.direction, reach, direct):
-            if occluded_by_synthetic(geo, origin, light.direction, reach):
-                return False
+        if occluded_by_synthetic(geo, origin, light.direction, reach):
+            return False
         count += 1
         if light.pdf <= 0.0:
             return True
@@ -326,11 +314,11 @@ def light_part(
 
 
 @wp.func
-def may_change(lights: Lights, position: wp.vec3, normal: wp.vec3, direct: Direct) -> bool:
+def may_change(geo: Geometry, lights: Lights, position: wp.vec3, normal: wp.vec3) -> bool:
     """Whether any light but domes may differ between before and after at a real surface."""
     for k in range(lights.count):
         if lights.kind[k] != DOME and not unlit(lights, k, position, normal):
-            if lights.role[k] == ADDED or may_shadow(lights, k, position, direct):
+            if lights.role[k] == ADDED or may_shadow(geo, lights, k, position):
                 return True
     return False
 
@@ -356,7 +344,7 @@ def _shade_direct(
         return
     # Asked before the rest of the surface is loaded: at most points of a picture the answer is no.
     if role == REAL and direct.with_before == 0:
-        if not may_change(lights, points.position[i], points.normal_g[i], direct):
+        if not may_change(geo, lights, points.position[i], points.normal_g[i]):
             return
     s = load_surface(points, i)
     wo = points.view[i]
@@ -366,7 +354,7 @@ def _shade_direct(
     for k in range(lights.count):
         if lights.kind[k] != DOME and not unlit(lights, k, s.position, s.normal_g):
             added = lights.role[k] == ADDED
-            shadowed = may_shadow(lights, k, s.position, direct)
+            shadowed = may_shadow(geo, lights, k, s.position)
             if role == SYNTHETIC or added or direct.with_before != 0 or shadowed:
                 part = light_part(draw, s, wo, role, geo, lights, k, direct, added, shadowed)
                 total += part.light

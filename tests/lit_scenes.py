@@ -16,7 +16,6 @@ from warp_dvct.launch import Launcher
 from warp_dvct.methods.delta_cone_tracing import _normals, _world
 from warp_dvct.passes.gbuffer import new_points
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
-from warp_dvct.passes.shading import bound_objects
 from warp_dvct.passes.voxels import Box, Voxels, voxelize
 from warp_dvct.scene import Camera, Light, Material, Mesh, Role, Scene
 
@@ -251,14 +250,11 @@ def cone_settings(escape: str = "ray", **more: Any) -> Any:
     return settings
 
 
-def direct_settings(scene: Scene, *, samples: int = 1, probes: int | None = None, with_before: bool = True) -> Any:
-    """Settings of the direct pass without a specular pass, with the box around the synthetic objects."""
+def direct_settings(*, samples: int = 1, probes: int | None = None, with_before: bool = True) -> Any:
+    """Settings of the direct pass without a specular pass."""
     direct = shading.Direct()
     direct.samples, direct.probes = samples, samples if probes is None else probes
     direct.edge_samples = 1
     direct.glossy, direct.alpha_max, direct.seed = 0, -1.0, 0
     direct.with_before = int(with_before)
-    bounds = scene.bounds(Role.SYNTHETIC)
-    if bounds is not None:
-        bound_objects(direct, *bounds)
     return direct

@@ -7,7 +7,6 @@ irradiance are invariant, and the radiant intensity of POINT lights is multiplie
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from warp_dvct.scene import Camera, Light, LightKind, Material, Mesh, Role, Scen
 
 # A closed mesh may be met from behind by the odd ray that slips through an edge; this many are no accident.
 BACKS_MET = 4
+BOX_MARGIN = 1e-3  # of the largest edge of the box around the objects: keeps rounding from culling a ray at its border
 
 
 @dataclass(frozen=True)
@@ -102,13 +102,6 @@ class DeviceScene:
     def synthetic_first(self) -> int:
         """Index of the first synthetic triangle in the per-triangle arrays."""
         return int(self.geometry.synthetic_first)
-
-    @cached_property
-    def synthetic_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Box (low, high) in volume space around the synthetic triangles, of which there must be some."""
-        corners = self.triangles_vs[self.synthetic_first :].reshape(-1, 3)
-        low, high = (np.array([end(corners[:, k]) for k in range(3)]) for end in (np.min, np.max))
-        return low, high
 
 
 @dataclass(frozen=True)
@@ -197,6 +190,11 @@ def _upload_geometry(launcher: Launcher, host: _HostTriangles, real: Any, synthe
     geometry.real = wp.uint64(real.id if real is not None else 0)
     geometry.synthetic = wp.uint64(synthetic.id if synthetic is not None else 0)
     geometry.synthetic_first = host.synthetic_first
+    if synthetic is not None:
+        corners = host.triangles[host.synthetic_first :].reshape(-1, 3)
+        low, high = corners.min(0), corners.max(0)
+        geometry.center = wp.vec3(*(0.5 * (low + high)))
+        geometry.extent = wp.vec3(*(0.5 * (high - low) + BOX_MARGIN * float(np.max(high - low))))
     geometry.corner_normals = launcher.array(host.normals.reshape(-1, 3), wp.vec3)
     geometry.corner_uvs = launcher.array(host.uvs.reshape(-1, 2), wp.vec2)
     geometry.corner_colors = launcher.array(host.colors.reshape(-1, 3), wp.vec3)

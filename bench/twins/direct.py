@@ -23,7 +23,7 @@ from warp_dvct.bench.twins.surfaces import HEIGHT, WIDTH, Surfaces, brdf_cos, ca
 from warp_dvct.kernels import path_tracing, rsm, shading
 from warp_dvct.methods.path_tracing import PathTracer
 from warp_dvct.passes.rsm import render_real
-from warp_dvct.passes.shading import bound_objects, shade_direct
+from warp_dvct.passes.shading import shade_direct
 from warp_dvct.scene import Light, LightKind
 
 SIZE, RADIUS, START = 32, 0.75, 2.0
@@ -108,7 +108,6 @@ def measure_direct(launcher: Any) -> list[Deviation]:
     settings = shading.Direct()
     settings.samples = settings.probes = settings.edge_samples = 1
     settings.alpha_max, settings.with_before = -1.0, 1
-    bound_objects(settings, *twin.device.synthetic_bounds)
     light, before = (launcher.zeros(buffer.count, wp.vec3) for _ in range(2))
     shade_direct(launcher, twin.device, buffer.points, buffer.count, settings, light=light, before=before)
 

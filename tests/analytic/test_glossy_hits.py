@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from warp_dvct.methods.path_tracing import gather_irradiance_reference
-from warp_dvct.passes.patches import bounce_field
 from warp_dvct.passes.gather import Gatherer, gather_all, glossy_hits
 from warp_dvct.passes.injection import empty_flux, inject
+from warp_dvct.passes.patches import bounce_field
 from warp_dvct.passes.rsm import render_rsm
 from warp_dvct.scene import Light, LightKind, Material, Role, Scene
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_dvct.passes.shading import bound_objects, shade_direct
+from warp_dvct.passes.shading import shade_direct
 from warp_dvct.scene import Light, LightKind, LightRole, Role
 
 L = np.array([2.0, 3.0, 4.0])
@@ -33,11 +33,13 @@ LIGHTS = {
 }
 
 
-def shaded(launcher, scene, points, count, *, world=None, cone=None, direct=None, **more):
-    """Light and before of points: float64 ``[count, 3]`` each."""
+def shaded(launcher, scene, points, count, *, world=None, cone=None, endless=False, **more):
+    """Light and before of points: float64 ``[count, 3]`` each. ``endless``: Nothing is culled by the objects' box."""
     out = [launcher.full(count, wp.vec3(7.0, 7.0, 7.0), wp.vec3) for _ in range(2)]
-    direct = direct or lit.direct_settings(scene, **more)
+    direct = lit.direct_settings(**more)
     device_scene = lit.upload(launcher, scene)
+    if endless:
+        device_scene.geometry.extent = wp.vec3(1e6, 1e6, 1e6)
     shade_direct(launcher, device_scene, points, count, direct, light=out[0], before=out[1], world=world, cone=cone)
     return tuple(a.numpy()[:count].astype(float) for a in out)
 
@@ -141,11 +143,11 @@ def test_culling_by_a_box_changes_nothing(launcher, name):
         source = replace(LARGE[name], position=position)
         scene = lit.scene_of(lit.mesh(walls), *objects, lights=(source,))
         points, _ = lit.points_on(launcher, lit.upload(launcher, scene), 1500, inset=0.01)
-        direct = lit.direct_settings(scene, samples=16, with_before=False)
-        culled = shaded(launcher, scene, points, 1500, direct=direct)[0]
-        direct = lit.direct_settings(scene, samples=16, with_before=False)
-        bound_objects(direct, np.full(3, -1e6), np.full(3, 1e6))
-        np.testing.assert_array_equal(culled, shaded(launcher, scene, points, 1500, direct=direct)[0])
+        culled, whole = (
+            shaded(launcher, scene, points, 1500, samples=16, with_before=False, endless=endless)[0]
+            for endless in (False, True)
+        )
+        np.testing.assert_array_equal(culled, whole)
         any_shadow |= bool(culled.any())
     assert any_shadow
 

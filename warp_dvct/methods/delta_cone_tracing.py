@@ -38,7 +38,7 @@ from warp_dvct.passes.patches import bounce_field, choose_patches
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
 from warp_dvct.passes.resolve import resolve
 from warp_dvct.passes.rsm import render_real, render_rsm
-from warp_dvct.passes.shading import bound_objects, shade_direct
+from warp_dvct.passes.shading import shade_direct
 from warp_dvct.passes.specular import find_glossy, shade_specular
 from warp_dvct.passes.voxels import Voxels, cut_triangles, part, voxelize
 from warp_dvct.plan import Plan
@@ -326,8 +326,6 @@ def _shade_direct(launcher: Launcher, device_scene: DeviceScene, plan: Plan, wor
     direct.alpha_max = plan.alpha_max
     direct.with_before = int(part.with_before)
     direct.seed = settings.seed
-    if device_scene.synthetic is not None:
-        bound_objects(direct, *device_scene.synthetic_bounds)
     cone = None
     if settings.shadows == "cone":
         cone = _cone(plan)

@@ -27,7 +27,7 @@ from warp_dvct.passes.history import Blender, History
 from warp_dvct.passes.ism import draw_isms, new_isms, ray_sight
 from warp_dvct.passes.point_cloud import SurfacePoints, sample_surfaces
 from warp_dvct.passes.resolve import resolve
-from warp_dvct.passes.shading import bound_objects, shade_direct
+from warp_dvct.passes.shading import shade_direct
 from warp_dvct.passes.specular import find_glossy
 from warp_dvct.passes.vpl_bounces import bounce_vpls
 from warp_dvct.passes.vpl_memory import check_memory
@@ -430,8 +430,6 @@ def direct_settings(plan: Plan, scene: Scene, device_scene: DeviceScene, with_be
     direct.alpha_max = plan.alpha_max
     direct.with_before = int(with_before)
     direct.seed = settings.seed
-    if device_scene.synthetic is not None:
-        bound_objects(direct, *device_scene.synthetic_bounds)
     return direct
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
@@ -14,7 +13,6 @@ from warp_dvct.kernels.gbuffer import Points
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.sorting import scan
 
-BOX_MARGIN = 1e-3  # of its largest edge: keeps rounding from culling a ray that barely meets what is in the box
 EDGE_SHARE = 8  # room for one edge point in so many pixels is there from the start, and saves most pictures a copy
 
 
@@ -102,7 +100,7 @@ def render_gbuffer(
     pixels = width * height
     shared = [scene.geometry, scene.materials, scene.camera]
     view = view or new_view(launcher, scene, width, height)
-    launcher.launch(kernels._see_synthetic, pixels, [*shared, *_box(scene), view.reach, width, height], [view.points])
+    launcher.launch(kernels._see_synthetic, pixels, [*shared, view.reach, width, height], [view.points])
     mark = launcher.zeros(pixels, wp.int32)
     if edge_samples > 0:
         launcher.launch(kernels._mark_edges, pixels, [view.points, width, height, int(paint)], [mark])
@@ -117,15 +115,6 @@ def render_gbuffer(
     if behind:
         hidden = _look_behind(launcher, scene, points, count, width)
     return GBuffer(width, height, edge_samples, points, count, edge_rank, edge_pixel, *hidden)
-
-
-def _box(scene: DeviceScene) -> tuple[Any, Any]:
-    """Middle and half edges of a box around the synthetic objects; the edges are negative where there are none."""
-    if scene.synthetic is None:
-        return wp.vec3(0.0, 0.0, 0.0), wp.vec3(-1.0, -1.0, -1.0)
-    low, high = scene.synthetic_bounds
-    extent = 0.5 * (high - low)
-    return wp.vec3(*(0.5 * (low + high))), wp.vec3(*(extent + BOX_MARGIN * max(float(np.max(extent)), 1.0e-30)))
 
 
 def compact(launcher: Launcher, mark: Any) -> tuple[Any, Any, int]:

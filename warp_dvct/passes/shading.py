@@ -4,17 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-import warp as wp
-
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import shading as kernels
 from warp_dvct.launch import Launcher
-
-
-def bound_objects(direct: Any, low: np.ndarray, high: np.ndarray) -> None:
-    """Tell ``kernels.shading.Direct`` of the box (volume space) around the synthetic objects, which cast shadows."""
-    direct.center, direct.extent = wp.vec3(*(0.5 * (low + high))), wp.vec3(*(0.5 * (high - low)))
 
 
 def shade_direct(
