@@ -118,6 +118,7 @@ def choose_trials(
     trials: dict[tuple, Trial] = {}
     left_out = []
     for method in methods or METHODS:
+        known = len(trials) + len(left_out)
         for trial in _of_method(method, wanted, bounces):
             trials.setdefault(_identity(trial), trial)
         for knob in (k for k in KNOBS if k.method == method and (not wanted or k.name in wanted)):
@@ -128,9 +129,10 @@ def choose_trials(
                 trial = Trial(method, knob.name, value, "balanced", {"bounces": str(bounces), **knob.settings(value)})
                 make_settings(trial.quality, trial.settings)  # a bad value is found before the work
                 trials.setdefault(_identity(trial), trial)
+        if methods and len(trials) + len(left_out) == known:
+            left_out.append(f"{method}: it has none of {', '.join(wanted)}")
     if not trials:
-        why = f" ({'; '.join(left_out)})" if left_out else f": {', '.join(methods)} has none of {', '.join(chosen)}"
-        raise OptionError(f"the sweep is empty{why}")
+        raise OptionError(f"the sweep is empty ({'; '.join(left_out)})")
     return list(trials.values()), left_out
 
 

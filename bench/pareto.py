@@ -77,6 +77,17 @@ def _verb(old: str, new: str) -> str:
     return {0.5: "halving", 2.0: "doubling", 0.25: "quartering", 4.0: "quadrupling"}.get(ratio, "changing")
 
 
+def _plain_ticks(axes: Any) -> None:
+    """Label the logarithmic axes by 0.02, 0.05, 0.1 instead of by powers of ten."""
+    ticker = importlib.import_module("matplotlib.ticker")
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        subs = (1, 2, 5) if high > 8 * low else (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
+        axis.set_major_locator(ticker.LogLocator(subs=subs, numticks=20))
+        axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(ticker.NullFormatter())
+
+
 def draw(rows: Sequence[Mapping[str, Any]], file: Path) -> list[Path]:
     """Draw points and fronts of one stage into ``file`` with the endings ``.svg`` and ``.png``; returns both.
 
@@ -106,6 +117,7 @@ def draw(rows: Sequence[Mapping[str, Any]], file: Path) -> list[Path]:
     where = axes.get_yaxis_transform()  # along x a share of the width
     axes.text(0.01, noise, "the truth's own noise", transform=where, fontsize=7, color="#777777", va="bottom")
     axes.set(xscale="log", yscale="log", xlabel="processor time of a frame [s]", ylabel="LDR-FLIP, mean of the picture")
+    _plain_ticks(axes)
     axes.set_title(
         f"{rows[0]['stage']}, {rows[0]['width']} x {rows[0]['height']}, {rows[0]['truth']['bounces']} bounces"
     )

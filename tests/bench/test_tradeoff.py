@@ -46,6 +46,9 @@ def test_own_knobs_values_and_what_a_stage_cannot_show():
     trials, left_out = choose_trials(("delta-cones",), ("glossy", "gather"), 1, False)
     assert {t.group for t in trials} == {"gather"}
     assert "no surface of the stage is glossy" in left_out[0]
+    trials, left_out = choose_trials(("delta-cones", "path-trace"), ("preset=draft", "gather.rays"), 1, False)
+    assert {t.method for t in trials} == {"delta-cones"}
+    assert left_out == ["path-trace: it has none of preset, gather.rays"]
 
 
 @pytest.mark.parametrize(
@@ -54,7 +57,7 @@ def test_own_knobs_values_and_what_a_stage_cannot_show():
         ((), ("gather.raysx",), "did you mean 'gather.rays'"),
         ((), ("seed",), "needs values"),
         ((), ("gather.rays=",), "empty"),
-        (("path-trace",), ("ism.size",), "sweep is empty: path-trace has none of ism.size"),
+        (("path-trace",), ("ism.size",), r"sweep is empty \(path-trace: it has none of ism.size"),
         (("delta-cones",), ("glossy.rays",), "sweep is empty .*glossy"),
         (("magic",), (), "method is 'magic'"),
         ((), ("gather.rays=0",), "outside"),
