@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from warp_dvct.cli.progress import Progress
 from warp_dvct.cli.quiet import start_warp
 from warp_dvct.image import check_writable
+
+if TYPE_CHECKING:
+    from warp_dvct.capture.reconstruct import Reconstruction
 
 SKIPPED_SHOWN = 10
 
@@ -83,15 +87,7 @@ SKIPPED_SHOWN = 10
 def reconstruct(
     capture: str,
     output: str,
-    voxel: float,
-    near: float,
-    far: float,
-    truncation: float,
-    weight: float | None,
     no_smooth: bool,
-    least_area: float | None,
-    close_holes: float,
-    triangles: int | None,
     track: str | None,
     markers: bool,
     marker_size: float | None,
@@ -105,6 +101,7 @@ def reconstruct(
     device: str,
     camera: str | None,
     threads: int | None,
+    **shape: Any,
 ) -> None:
     """Fuse the depth images of CAPTURE into a mesh and write a stage of it, its cameras, plates and lights."""
     if not output.lower().endswith((".usda", ".usd", ".usdc")):
@@ -124,17 +121,7 @@ def reconstruct(
     from warp_dvct.capture.stage import open_capture
     from warp_dvct.capture.tracking import track_capture
 
-    fusion = FusionOptions(
-        voxel=voxel,
-        truncation=truncation,
-        near=near,
-        far=far,
-        weight=weight,
-        smooth=not no_smooth,
-        least_area=least_area,
-        close_holes=close_holes,
-        triangles=triangles,
-    )
+    fusion = FusionOptions(smooth=not no_smooth, **shape)
     options = ReconstructOptions(fusion, albedo, probe, estimate_light, not no_light, unseen, seed)
     opened = open_capture(capture, camera=camera)
     poses, skipped = None, Skipped()
@@ -146,24 +133,21 @@ def reconstruct(
                 assert track is not None
                 found = track_capture(opened, track, fusion, threads=threads, progress=progress.update)
         poses, skipped.reasons = found.poses, dict(found.lost)
+    frames = CaptureFrames(opened, poses)
     with Progress(os.path.basename(output)) as progress:
-        made = run(
-            opened,
-            CaptureFrames(opened, poses),
-            output,
-            options,
-            poses=poses,
-            skipped=skipped,
-            device=device,
-            threads=threads,
-            progress=progress.update,
-        )
+        more = {"device": device, "threads": threads, "progress": progress.update}
+        made = run(opened, frames, output, options, poses=poses, skipped=skipped, **more)
+    _report(made, output, len(opened))
+
+
+def _report(made: Reconstruction, output: str, count: int) -> None:
+    """What became of the frames, and what was noticed."""
     mesh = made.mesh
     for note in made.notes:
         click.echo(f"warp-dvct: {note}", err=True)
-    _report_skipped(mesh.skipped, len(opened))
+    _report_skipped(mesh.skipped, count)
     click.echo(
-        f"{output}: {len(mesh.triangles)} triangles from {mesh.frames} of {len(opened)} frames;"
+        f"{output}: {len(mesh.triangles)} triangles from {mesh.frames} of {count} frames;"
         f" {mesh.dropped} of {mesh.components} parts dropped"
     )
 

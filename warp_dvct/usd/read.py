@@ -85,23 +85,27 @@ def read_stage(
         try:
             eye = None if view is not None else choose_camera(ctx, camera)
             found = Collector(ctx, Roles(ctx, real, synthetic, render_pass), tuple(purposes)).collect()
-            if not allow_empty_roles:
-                require_roles(stage, found.defined)
+            _require(stage, found, allow_empty_roles, allow_no_light)
             if eye is not None:
                 view, plate = conform(read_camera(eye, ctx), ctx), read_plate(eye, ctx, plate)
             assert view is not None
-            if not (found.lights_defined or allow_no_light):
-                raise StageError(f"{name_of(stage)} has no light; add a UsdLux light")
             photograph = None if plate is None else os.fspath(plate)
             scene = _assemble(ctx, view, photograph, found, images or ImageCache())
         except StageError as error:
-            # What is missing is often in the file that did not load.
             if not broken:
                 raise
+            # What is missing is often in the file that did not load.
             raise StageError(f"{error} ({_list(broken)})") from error
     if strict and scene.notices:
         raise StageError(f"{name_of(stage)}: --strict, and this is not modelled: {_list(scene.notices)}")
     return scene
+
+
+def _require(stage: Usd.Stage, found: Collection, allow_empty_roles: bool, allow_no_light: bool) -> None:
+    if not allow_empty_roles:
+        require_roles(stage, found.defined)
+    if not (found.lights_defined or allow_no_light):
+        raise StageError(f"{name_of(stage)} has no light; add a UsdLux light")
 
 
 def _assemble(ctx: Context, camera: Camera, plate: str | None, found: Collection, images: ImageCache) -> Scene:
