@@ -236,7 +236,7 @@ def measure_bounces(launcher: Any) -> list[Deviation]:
     link = rng.integers(-1, count, (count, RAYS, 2)).astype(np.int32)
     albedo, irradiance = rng.uniform(0, 1, (count, 3)), rng.uniform(0, 9, (count, 2, 3))
     real = rng.integers(0, 2, count).astype(np.int32)
-    values = np.zeros(count, Patch.numpy_dtype())
+    values: Any = np.zeros(count, Patch.numpy_dtype())
     values["albedo"], values["real"] = albedo, real
     patches = launcher.array(values, Patch)
     last = launcher.array(irradiance.reshape(-1, 3).astype(np.float32), wp.vec3)
