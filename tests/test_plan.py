@@ -219,7 +219,7 @@ def test_describe_names_every_pass():
         assert ("left out" in line) is not entry.needed
         assert entry.why in line
         assert ("MiB" in line) is entry.needed
-    assert "128^3" in text
+    assert "64^3" in text
     assert "64 x 48 pixels" in text
 
 
@@ -229,7 +229,7 @@ def test_plan_is_json(method):
     again = json.loads(json.dumps(plan.to_dict(), allow_nan=False))
     assert again["method"] == method
     assert [p["name"] for p in again["passes"]] == [p.name for p in plan.passes]
-    assert again["settings"]["volume_resolution"] == 128
+    assert again["settings"]["volume_resolution"] == 64
 
 
 @pytest.mark.parametrize("n", [64, 200])
