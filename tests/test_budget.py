@@ -94,7 +94,7 @@ def test_counts_follow_their_settings(surveys):
     assert twice["rays"] == pytest.approx(base["gather"]["rays"] * (128 + more[1]) / (64 + more[0]))
     assert twice["gathered"] == pytest.approx(base["gather"]["gathered"])
     assert counted(rsm__texels=128, volume__coarse=0)["rsm"]["texels"] == pytest.approx(4 * base["rsm"]["texels"])
-    fine = counted(volume__resolution=256, volume__coarse=0)["voxelize"]["records"]
+    fine = counted(volume__resolution=128, volume__coarse=0)["voxelize"]["records"]
     assert fine == pytest.approx(4 * base["voxelize"]["records"])
     few, many = (counted(bounces=b)["bounces"]["transfers"] for b in (4, 6))
     assert many == pytest.approx(2 * few)

@@ -99,7 +99,8 @@ def test_a_slow_machine_is_planned_for(surveys):
     """Everything takes twice as long: half as much fits, and nothing is refused for it."""
     usual, slow = (chosen(surveys, seconds=2.0, slowness=slowness) for slowness in (1.0, 2.0))
     assert 0.9 * 2.0 <= slow.seconds <= 0.95 * 2.0
-    assert slow.cpu_seconds == pytest.approx(0.5 * usual.cpu_seconds, rel=0.1)
+    as_usual = price(usual.pace.count(slow.settings), usual.pace.units)
+    assert as_usual == pytest.approx(0.5 * usual.seconds, rel=0.1)
     assert slow.floor == pytest.approx(usual.floor)
     assert slow.error > usual.error
     assert "takes 2.0 times as long just now" in slow.describe()

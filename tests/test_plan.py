@@ -53,7 +53,7 @@ def test_fine_volume_is_a_cube_around_the_objects():
     edge = 1 / plan.scale
     assert edge == pytest.approx(0.4, rel=0.0906), "steps of a quarter of an octave"
     np.testing.assert_allclose(np.array(plan.origin) + 0.5 * edge, [0.5, 0.3, 0.5], atol=edge / 16)
-    assert (plan.fine.low, plan.fine.edge, plan.fine.n) == ((0.0, 0.0, 0.0), 1.0, 128)
+    assert (plan.fine.low, plan.fine.edge, plan.fine.n) == ((0.0, 0.0, 0.0), 1.0, 64)
     assert plan.coarse is not None
     corners = (np.array([[0.05] * 3, [0.95] * 3]) - plan.origin) * plan.scale
     low = np.array(plan.coarse.low)

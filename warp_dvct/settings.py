@@ -30,7 +30,7 @@ class Settings:
     bounces: int = _knob(6, "indirect bounces: 0 direct light only, 1 the paper's single bounce", low=0, high=64)
     antialias: int = _knob(4, "shading points per edge pixel; 0 for none", low=0, high=64)
 
-    # Rays see no difference between these and the paper's 256: what shows is how many texels a voxel's light comes from.
+    # Rays see no difference between these and the paper's 256: what shows is how many texels light a voxel.
     volume_resolution: int = _knob(64, "voxels an edge of the fine volume", low=1, high=1024)
     volume_scale: float = _knob(
         2.0, "edge of the fine volume over the synthetic bounding box's largest", low=1.0, high=1e3

@@ -38,6 +38,7 @@ COARSE = {
     "volume.resolution": 32,
     "volume.coarse": 32,
     "rsm.texels": 96,
+    "rsm.density": 1,
     "shadows.samples": 4,
     "shadows.probes": 4,
     "gather.rays": 16,
@@ -48,7 +49,8 @@ COARSE = {
     "patches.count": 2400,
     "patches.rays": 4,
 }
-REFERENCE = {"volume.resolution": 256, "volume.coarse": 128, "rsm.texels": 8192}  # at which map sizes are taken
+# At which map sizes are taken.
+REFERENCE = {"volume.resolution": 256, "volume.coarse": 128, "rsm.texels": 8192, "rsm.density": 1}
 
 
 @dataclass(frozen=True)
