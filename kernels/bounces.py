@@ -311,6 +311,31 @@ def shown_area(
     return total
 
 
+@wp.func
+def shown_position(
+    geo: Geometry,
+    normals: wp.array(dtype=wp.vec3),
+    pieces: Fragments,
+    field: BounceField,
+    record: int,
+    face: int,
+    center: wp.vec3,
+    axis: wp.vec3,
+    role: int,
+) -> wp.vec3:
+    """Where what a role shows on a record's face gets its light: at the middle of the voxel or, where a thin wall parts
+    the two, on the largest piece. One side of a wall is often in another room than that middle."""
+    position = center
+    if field.has_walls != 0:
+        fragment = largest_fragment(geo, normals, pieces, record, face, role)
+        if fragment >= 0:
+            place = fragment_position(pieces, fragment)
+            point = off_surface(field, place, axis)
+            if is_parted(wall_beside(field, point), point, center):
+                position = place
+    return position
+
+
 @wp.struct
 class Received:
     """Irradiance of a piece of surface, and whether something covers it closely."""
@@ -334,7 +359,7 @@ def received(
     """What a role's surfaces behind a record's face get; where there are several sheets, its largest piece tells which
     one that is."""
     result = Received()
-    position = center
+    position = shown_position(geo, normals, pieces, field, record, face, center, axis, role)
     home = home_of(field, position, axis, role)
     if home.several != 0:
         fragment = largest_fragment(geo, normals, pieces, record, face, role)
@@ -402,7 +427,8 @@ def _reinject(
                     added = received(geo, normal_in, pieces, field, i, face, center, axis, 1)
                     after += wp.cw_mul(albedo_in[2 * i + 1], added.light.after) * (1.0 - real_share)
             else:
-                light = bounced_irradiance(field, center, axis, 0)
+                position = shown_position(geo, normal_in, pieces, field, i, face, center, axis, 0)
+                light = bounced_irradiance(field, position, axis, 0)
                 before = wp.cw_mul(albedo_in[2 * i], light.before)
                 after = wp.cw_mul(albedo_in[2 * i], light.after)
             flux_out[(i * 6 + face) * 2] += before * area[0]

@@ -20,20 +20,21 @@ def series(albedo, terms: int) -> np.ndarray:
 
 
 class Solver:
-    """A lit scene with its patches."""
+    """A lit scene with its patches, those of the last volume; re-injection is into the first."""
 
-    def __init__(self, launcher, scene, flux_of, *, n=48, most=1500):
+    def __init__(self, launcher, scene, flux_of, *, n=48, most=1500, boxes=None):
         self.launcher = launcher
         self.flux = None
 
         def keep(device_scene, voxels):
-            self.flux = flux_of(device_scene, voxels)
-            return self.flux
+            flux = flux_of(device_scene, voxels)
+            self.flux = flux if self.flux is None else self.flux
+            return flux
 
-        self.lit = lit.lit_world(launcher, scene, n, keep)
+        self.lit = lit.lit_world(launcher, scene, n, keep, boxes=boxes)
         self.voxels = self.lit.volumes[0]
         self.normals = lit.unit_normals(launcher, self.lit.device_scene)
-        self.patches = choose_patches(launcher, self.lit.device_scene, self.voxels, self.normals, most)
+        self.patches = choose_patches(launcher, self.lit.device_scene, self.lit.volumes[-1], self.normals, most)
 
     def solve(self, bounces, rays=64, seed=0):
         """Device array and host values ``[patches, solution, 3]``."""
@@ -170,6 +171,43 @@ def test_a_thin_object_on_a_wall_leaves_before_alone(launcher, height, black):
     for solution in (0,) if black else (0, 1):
         shown = lit.areas(solver.voxels)[..., solution] > 0.05
         np.testing.assert_allclose(radiosity[:, :, solution][shown].mean(0), B + albedo * expected, rtol=0.01)
+
+
+@pytest.mark.parametrize("role", [Role.REAL, Role.SYNTHETIC])
+@pytest.mark.parametrize("side", [0.2, 0.8])
+def test_both_sides_of_a_thin_wall_keep_to_their_rooms(launcher, role, side):
+    """Two rooms, one of which sends B, with a box in each: the wall's dark side gets nothing, the other the series.
+
+    The wall lies between patches and before or behind the middle of the fine voxels that hold it: that middle is beyond
+    one of its sides, near a box that looks the same way.
+    """
+    parts = [lit.mesh(lit.room(0.4)), lit.mesh(lit.cuboid(0.5, (0.0005, 0.41, 0.41)))]
+    parts += [lit.mesh(lit.cuboid((x, 0.5, 0.5), (0.03, 0.1, 0.1)), role) for x in (0.42, 0.58)]
+    n, voxel = 32, 1 / 96
+    low = 0.5 - (n // 2 + side) * voxel
+    boxes = (((low, 0.34, 0.34), n * voxel, n), ((0.0, 0.0, 0.0), 1.0, 48))
+
+    def flux(_, voxels):
+        """All that looks around in the room at greater x; voxels that the wall cuts show its side alone."""
+        records = lit.look_up(voxels)
+        cells = np.argwhere(records >= 0)
+        edge = voxels.box.edge / voxels.box.n
+        begin = np.zeros(voxels.level_records[0])
+        begin[records[records >= 0]] = voxels.box.low[0] + cells[:, 0] * edge
+        lights = np.repeat((begin > 0.5 - 1e-6)[:, None], 6, 1)
+        lights[(begin < 0.5005) & (begin + edge > 0.5005), 0] = True
+        return lit.launcher_vectors(launcher, ((lit.areas(voxels) * lights[..., None])[..., None] * B).reshape(-1, 3))
+
+    solver = Solver(launcher, lit.scene_of(*parts), flux, boxes=boxes)
+    assert solver.patches.has_walls
+    total, _ = solver.solve(10)
+    radiosity = solver.reinjected(total)
+    wall = lit.look_up(solver.voxels)[n // 2].ravel()
+    assert (lit.areas(solver.voxels)[wall, :2] > 0.9 * voxel**2).all()
+    expected = B + np.array(lit.GREY.base_color) * B * series(lit.GREY.base_color, 10)
+    for solution in (0, 1):
+        assert radiosity[wall, 1, solution].max() < 0.002
+        np.testing.assert_allclose(radiosity[wall, 0, solution], np.broadcast_to(expected, (n * n, 3)), rtol=0.05)
 
 
 def test_number_of_patches_follows_what_is_asked(launcher):
