@@ -13,6 +13,7 @@ import numpy as np
 
 from warp_dvct.bench.error import MANY_BOUNCES, read, stage_file
 from warp_dvct.bench.references import ReferenceStore
+from warp_dvct.budget import check_request
 from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher
 from warp_dvct.metrics import flip_ldr, import_flip
@@ -46,10 +47,12 @@ def measure(
     """A row per budget: a frame with a plate after a small warm-up; budgets below the floor say so.
 
     Raises:
-        OptionError: No budget, no repeat, or as the relighter raises.
+        OptionError: No budget, one that is not a positive number, no repeat, or as the relighter raises.
     """
     if not options.budgets or options.repeats < 1:
         raise OptionError("there is no budget to keep; give --budget SECONDS, and --repeats of at least 1")
+    for budget in options.budgets:
+        check_request(budget, None)
     from warp_dvct.relighter import Relighter
 
     scene = read(stage_file(stage))

@@ -69,6 +69,14 @@ def test_a_tiny_room_keeps_a_budget(tmp_path, monkeypatch):
     assert "of 1 budgets" in result.output
 
 
+@pytest.mark.parametrize("budget", ["0", "-1", "nan", "inf"])
+def test_what_is_no_budget_is_refused_before_the_work(budget, tmp_path, monkeypatch):
+    monkeypatch.setattr(module.ReferenceStore, "of", None)  # a truth would take its time
+    words = ["budget", "--stage", "colour_bleeding", "--budget", "1", "--budget", budget, "--cache", str(tmp_path)]
+    with pytest.raises(OptionError, match=r"--budget is .*; give a positive number"):
+        CliRunner().invoke(bench, words, catch_exceptions=False)
+
+
 def sweep_row(stage: str, flip: float, noise: float = 0.0, **settings) -> dict:
     """A point of a sweep with a known error."""
     pairs = {k.replace("__", "."): v for k, v in settings.items()}
