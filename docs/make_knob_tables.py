@@ -18,6 +18,7 @@ PAPER = "cones.delta=split cones.filter=isotropic cones.coverage=product cones.e
 TABLES = {
     "rays or cones": [
         "`gather=cones`: gather=cones",
+        "`gather=cones volume.resolution=128`: gather=cones volume.resolution=128",
         "cones at every pixel: gather=cones gather.stride=1 gather.object_stride=1",
         "`gather=cones cones.delta=split`: gather=cones cones.delta=split",
         f"the paper's form: gather=cones {PAPER}",
@@ -39,12 +40,14 @@ TABLES = {
         "64, all traced: shadows.samples=64 shadows.probes=64",
     ],
     "volume and maps": [
-        "`volume.resolution=64`: volume.resolution=64",
+        "`volume.resolution=32`: volume.resolution=32",
+        "`volume.resolution=128`: volume.resolution=128",
+        "`volume.resolution=128 rsm.density=1`: volume.resolution=128 rsm.density=1",
         "`volume.resolution=256 volume.coarse=128`: volume.resolution=256 volume.coarse=128",
-        "`volume.resolution=512`: volume.resolution=512",
         "`rsm.texels=128`: rsm.texels=128",
         "`rsm.texels=256`: rsm.texels=256",
-        "`rsm.density=2`: rsm.density=2",
+        "`rsm.density=1`: rsm.density=1",
+        "`rsm.density=4`: rsm.density=4",
     ],
     "edges and lobes": [
         "`antialias=0`: antialias=0",
