@@ -186,7 +186,8 @@ def interpolated(
     fx = local[0] - float(x0)
     fy = local[1] - float(y0)
     fz = local[2] - float(z0)
-    for corner in range(8):
+    corners = int(8)  # not a constant: unrolled, callers spill twice as much on GPUs
+    for corner in range(corners):
         dx = corner & 1
         dy = (corner >> 1) & 1
         dz = corner >> 2

@@ -8,6 +8,7 @@ found too.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -104,24 +105,55 @@ class Checker:
         return f" (pixel {point % self.width}, {point // self.width})"
 
 
+@dataclass(frozen=True)
+class _Member:
+    """One member of an array of structs, as far as an array of its own would have to answer."""
+
+    array: wp.array
+    name: str
+
+    @property
+    def dtype(self) -> Any:
+        return self.array.dtype.vars[self.name].type
+
+    @property
+    def size(self) -> int:
+        return self.array.size
+
+    def __len__(self) -> int:
+        return len(self.array)
+
+    def numpy(self) -> np.ndarray:
+        return self.array.numpy()[self.name]
+
+
 def poison(array: wp.array) -> wp.array:
-    """Fill a fresh float array with :data:`UNWRITTEN`."""
-    if _scalar(array) in (wp.float32, wp.float64) and array.size:
+    """Fill a fresh float array with :data:`UNWRITTEN`, and one of structs with zeros."""
+    if hasattr(array.dtype, "vars"):
+        array.zero_()
+    elif _scalar(array) in (wp.float32, wp.float64) and array.size:
         width = wp.types.type_size(array.dtype)
         array.fill_(float(UNWRITTEN) if width == 1 else array.dtype(*[float(UNWRITTEN)] * width))
     return array
 
 
 def _arrays(names: Sequence[str], values: Sequence[Any]) -> Iterator[tuple[str, Any]]:
-    """Arrays among a launch's arguments, and the members of structs, each with its name."""
+    """Arrays among a launch's arguments and in their structs, those of structs member by member, each with its name."""
     for name, value in zip(names, values, strict=False):
         if isinstance(value, wp.array):
-            yield name, value
+            yield from _members(name, value)
         elif hasattr(value, "_cls"):
             for member in value._cls.vars:
                 inner = getattr(value, member)
                 if isinstance(inner, wp.array):
-                    yield f"{name}.{member}", inner
+                    yield from _members(f"{name}.{member}", inner)
+
+
+def _members(name: str, array: wp.array) -> Iterator[tuple[str, Any]]:
+    if hasattr(array.dtype, "vars"):
+        yield from ((f"{name}.{member}", _Member(array, member)) for member in array.dtype.vars)
+    else:
+        yield name, array
 
 
 def _scalar(array: Any) -> Any:
@@ -133,7 +165,7 @@ def _values(name: str, array: Any) -> np.ndarray | None:
     if not array.size or (_scalar(array) not in (wp.float32, wp.float64) and _key(name) not in RANGES):
         return None
     values = array.numpy()
-    return values.reshape(len(values), -1) if values.dtype.names is None else None
+    return values.reshape(len(values), -1)
 
 
 def _key(name: str) -> str:
