@@ -124,7 +124,8 @@ class _Member:
         return len(self.array)
 
     def numpy(self) -> np.ndarray:
-        return self.array.numpy()[self.name]
+        structs: Any = self.array.numpy()
+        return structs[self.name]
 
 
 def poison(array: wp.array) -> wp.array:
