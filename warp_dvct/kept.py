@@ -1,7 +1,8 @@
 """What a moving shot keeps between frames: results that depend on the static, real part of the scene alone.
 
-Every pass that uses it does its real part by the same code whether the result is kept or not, and nothing writes to
-what is kept: a frame of a shot equals the same frame rendered from scratch bit for bit.
+Every pass that uses it does its real part by the same code whether the result is kept or not, and what is kept is not
+written to but for the camera's view, out of which the next frame takes the objects again (``passes.gbuffer.View``): a
+frame of a shot equals the same frame rendered from scratch bit for bit.
 """
 
 from __future__ import annotations
