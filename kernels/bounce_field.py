@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_dvct.kernels.volume import Volume, face_of, find_record
+from warp_dvct.kernels.volume import Volume, between_voxels, corner_step, corner_weight, face_of, find_record
 
 wp.set_module_options({"enable_backward": False})
 
@@ -179,27 +179,20 @@ def interpolated(
     result = BouncedSum()
     result.before = wp.vec3(0.0, 0.0, 0.0)
     result.after = wp.vec3(0.0, 0.0, 0.0)
-    local = (at - field.volume.low) / (field.volume.voxel * float(1 << field.level)) - wp.vec3(0.5, 0.5, 0.5)
-    x0 = int(wp.floor(local[0]))
-    y0 = int(wp.floor(local[1]))
-    z0 = int(wp.floor(local[2]))
-    fx = local[0] - float(x0)
-    fy = local[1] - float(y0)
-    fz = local[2] - float(z0)
+    middle = between_voxels(field.volume, field.level, at)
     corners = int(8)  # not a constant: unrolled, callers spill twice as much on GPUs
     for corner in range(corners):
-        dx = corner & 1
-        dy = (corner >> 1) & 1
-        dz = corner >> 2
-        record = find_record(field.volume, field.level, x0 + dx, y0 + dy, z0 + dz)
+        step = corner_step(corner)
+        voxel = middle.voxel + step
+        record = find_record(field.volume, field.level, voxel[0], voxel[1], voxel[2])
         if record >= 0:
-            near = wp.where(dx == 1, fx, 1.0 - fx) * wp.where(dy == 1, fy, 1.0 - fy) * wp.where(dz == 1, fz, 1.0 - fz)
+            near = corner_weight(middle, step)
             for axis in range(3):
                 share = wp.abs(normal[axis])
                 if share > SHOWN:
                     patch = int(-1)
                     if home.mixed != 0:
-                        patch = seen_from(field, home, axis, x0 + dx, y0 + dy, z0 + dz)
+                        patch = seen_from(field, home, axis, voxel[0], voxel[1], voxel[2])
                     parted = home.mixed != 0 and patch < 0
                     if patch < 0:
                         patch = field.table[(record - field.level_first) * 6 + face_of(axis, normal[axis])]

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_dvct.kernels.volume import Volume, face_of, find_record
+from warp_dvct.kernels.volume import Volume, between_voxels, corner_step, corner_weight, face_of, find_record
 
 wp.set_module_options({"enable_backward": False})
 
@@ -41,13 +41,7 @@ def sample_volume(volume: Volume, level: int, position: wp.vec3, direction: wp.v
     down at it are the surface's own lining, which interpolation would spread over to the cone's side.
     """
     size = volume.voxel * float(1 << level)
-    local = (position - volume.low) / size - wp.vec3(0.5, 0.5, 0.5)
-    x0 = int(wp.floor(local[0]))
-    y0 = int(wp.floor(local[1]))
-    z0 = int(wp.floor(local[2]))
-    fx = local[0] - float(x0)
-    fy = local[1] - float(y0)
-    fz = local[2] - float(z0)
+    at = between_voxels(volume, level, position)
     face_x = 2 * face_of(0, -direction[0])
     face_y = 2 * face_of(1, -direction[1])
     face_z = 2 * face_of(2, -direction[2])
@@ -62,29 +56,30 @@ def sample_volume(volume: Volume, level: int, position: wp.vec3, direction: wp.v
     height = (plane[0] * position[0] + plane[1] * position[1] + plane[2] * position[2] - plane[3]) / size
     near = height < 1.5 * spread
     for corner in range(8):
-        dx = corner & 1
-        dy = (corner >> 1) & 1
-        dz = corner >> 2
-        record = find_record(volume, level, x0 + dx, y0 + dy, z0 + dz)
+        step = corner_step(corner)
+        voxel = at.voxel + step
+        record = find_record(volume, level, voxel[0], voxel[1], voxel[2])
         if record >= 0:
-            weight = wp.where(dx == 1, fx, 1.0 - fx) * wp.where(dy == 1, fy, 1.0 - fy) * wp.where(dz == 1, fz, 1.0 - fz)
+            weight = corner_weight(at, step)
             share = wp.vec3(wx, wy, wz)
             if near:
-                above = height + plane[0] * (float(dx) - fx) + plane[1] * (float(dy) - fy) + plane[2] * (float(dz) - fz)
+                above = height
+                for axis in range(3):
+                    above += plane[axis] * (float(step[axis]) - at.way[axis])
                 if above < 0.5 * spread:
                     for axis in range(3):
                         if direction[axis] * plane[axis] > 0.0:
                             share[axis] = 0.0
-            at = record * 12
+            first = record * 12
             result.before += weight * (
-                share[0] * volume.field[at + face_x]
-                + share[1] * volume.field[at + face_y]
-                + share[2] * volume.field[at + face_z]
+                share[0] * volume.field[first + face_x]
+                + share[1] * volume.field[first + face_y]
+                + share[2] * volume.field[first + face_z]
             )
             result.after += weight * (
-                share[0] * volume.field[at + face_x + 1]
-                + share[1] * volume.field[at + face_y + 1]
-                + share[2] * volume.field[at + face_z + 1]
+                share[0] * volume.field[first + face_x + 1]
+                + share[1] * volume.field[first + face_y + 1]
+                + share[2] * volume.field[first + face_z + 1]
             )
     return result
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_dvct.kernels.environment import Environment
-from warp_dvct.kernels.volume import Volume, face_of, find_record
+from warp_dvct.kernels.volume import Volume, between_voxels, corner_step, corner_weight, face_of, find_record
 
 wp.set_module_options({"enable_backward": False})
 
@@ -44,29 +44,22 @@ class FieldPair:
 @wp.func
 def field_pair(volume: Volume, position: wp.vec3, normal: wp.vec3) -> FieldPair:
     """Both solutions of the level-0 faces around a surface point, trilinear, weighted by the surface's normal."""
-    local = (position - volume.low) / volume.voxel - wp.vec3(0.5, 0.5, 0.5)
-    x0 = int(wp.floor(local[0]))
-    y0 = int(wp.floor(local[1]))
-    z0 = int(wp.floor(local[2]))
-    fx = local[0] - float(x0)
-    fy = local[1] - float(y0)
-    fz = local[2] - float(z0)
+    at = between_voxels(volume, 0, position)
     total = FieldPair()
     total.before = wp.vec4(0.0, 0.0, 0.0, 0.0)
     total.after = wp.vec4(0.0, 0.0, 0.0, 0.0)
     for corner in range(8):
-        dx = corner & 1
-        dy = (corner >> 1) & 1
-        dz = corner >> 2
-        record = find_record(volume, 0, x0 + dx, y0 + dy, z0 + dz)
+        step = corner_step(corner)
+        voxel = at.voxel + step
+        record = find_record(volume, 0, voxel[0], voxel[1], voxel[2])
         if record >= 0:
-            weight = wp.where(dx == 1, fx, 1.0 - fx) * wp.where(dy == 1, fy, 1.0 - fy) * wp.where(dz == 1, fz, 1.0 - fz)
+            weight = corner_weight(at, step)
             for axis in range(3):
                 share = wp.abs(normal[axis])
                 if share > 0.01:
-                    at = record * 12 + 2 * face_of(axis, normal[axis])
-                    total.before += (weight * share) * volume.field[at]
-                    total.after += (weight * share) * volume.field[at + 1]
+                    face = record * 12 + 2 * face_of(axis, normal[axis])
+                    total.before += (weight * share) * volume.field[face]
+                    total.after += (weight * share) * volume.field[face + 1]
     return total
 
 

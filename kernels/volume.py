@@ -81,3 +81,37 @@ def face_weight(normal: wp.vec3, face: int) -> float:
     """How much a surface of that normal shows on a face: max(0, n . e)."""
     along = normal[face / 2]
     return wp.max(0.0, wp.where((face & 1) == 0, along, -along))
+
+
+@wp.struct
+class Between:
+    """Where a point is between the middles of eight voxels: the lowest of them, and the way from it to the next along
+    each axis, 0 to 1."""
+
+    voxel: wp.vec3i
+    way: wp.vec3
+
+
+@wp.func
+def between_voxels(volume: Volume, level: int, position: wp.vec3) -> Between:
+    local = (position - volume.low) / (volume.voxel * float(1 << level)) - wp.vec3(0.5, 0.5, 0.5)
+    at = Between()
+    at.voxel = wp.vec3i(int(wp.floor(local[0])), int(wp.floor(local[1])), int(wp.floor(local[2])))
+    at.way = local - wp.vec3(float(at.voxel[0]), float(at.voxel[1]), float(at.voxel[2]))
+    return at
+
+
+@wp.func
+def corner_step(corner: int) -> wp.vec3i:
+    """From the lowest of eight voxels to number ``corner``."""
+    return wp.vec3i(corner & 1, (corner >> 1) & 1, corner >> 2)
+
+
+@wp.func
+def corner_weight(at: Between, step: wp.vec3i) -> float:
+    """Trilinear weight of the voxel that is ``step`` from the lowest."""
+    return (
+        wp.where(step[0] == 1, at.way[0], 1.0 - at.way[0])
+        * wp.where(step[1] == 1, at.way[1], 1.0 - at.way[1])
+        * wp.where(step[2] == 1, at.way[2], 1.0 - at.way[2])
+    )
