@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from warp_dvct.bench.error import MANY_BOUNCES, read, stage_file
-from warp_dvct.bench.references import ReferenceStore
+from warp_dvct.bench.references import Reference, ReferenceStore
+from warp_dvct.bench.rows import commit
 from warp_dvct.budget import check_request
+from warp_dvct.cost import load_model
 from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher
 from warp_dvct.metrics import flip_ldr, import_flip
@@ -42,10 +48,16 @@ class BudgetOptions:
 
 
 def measure(
-    stage: str, options: BudgetOptions, report: Callable[[dict[str, Any]], None] = lambda row: None
+    stage: str,
+    options: BudgetOptions,
+    report: Callable[[dict[str, Any], bool], None] = lambda row, known: None,
+    known: Mapping[str, dict[str, Any]] = MappingProxyType({}),
 ) -> list[dict[str, Any]]:
     """A row per budget: a frame with a plate after a small warm-up; budgets below the floor say so.
 
+    Args:
+        report: Called with each row as soon as it is measured, and with whether it was known.
+        known: Rows by their ``key``, which are not measured again.
     Raises:
         OptionError: No budget, one that is not a positive number, no repeat, or as the relighter raises.
     """
@@ -53,37 +65,69 @@ def measure(
         raise OptionError("there is no budget to keep; give --budget SECONDS, and --repeats of at least 1")
     for budget in options.budgets:
         check_request(budget, None)
-    from warp_dvct.relighter import Relighter
-
-    scene = read(stage_file(stage))
-    height = max(1, round(options.width / scene.camera.aspect))
-    size = {"width": options.width, "height": height, "device": options.device, "threads": options.threads}
-    truth = None
     if options.samples:
         import_flip()
-        launcher = Launcher(options.device, options.threads)
-        store = ReferenceStore.of(scene, options, launcher)
-        truth = store.get(MANY_BOUNCES)
-    plate = truth.before if truth else np.full((height, options.width, 3), 0.5, np.float32)
-    small = Relighter(scene, method=options.method, width=48, device=options.device, threads=options.threads)
-    small.render(np.full((small.height, 48, 3), 0.5, np.float32))  # compiles
+    bench = _Bench(stage, options)
     rows = []
     for budget in options.budgets:
-        row: dict[str, Any] = {"kind": KIND, "stage": Path(stage).stem, "width": options.width, "height": height}
+        key = bench.key(budget)
+        rows.append(known[key] if key in known else bench.measure(key, budget))
+        report(rows[-1], key in known)
+    return rows
+
+
+class _Bench:
+    """One stage; its truth and its kernels are made when the first budget is measured."""
+
+    def __init__(self, stage: str, options: BudgetOptions) -> None:
+        self.options = options
+        self.scene = read(stage_file(stage))
+        self.name = Path(stage).stem
+        height = max(1, round(options.width / self.scene.camera.aspect))
+        self.size = {"width": options.width, "height": height, "device": options.device, "threads": options.threads}
+        launcher = Launcher(options.device, options.threads)
+        self.store = ReferenceStore.of(self.scene, replace(options, samples=options.samples or 1), launcher)
+
+    def key(self, budget: float) -> str:
+        """What a row depends on besides the machine's mood: scene, size, truth, settings, sources, unit costs."""
+        o = self.options
+        model = None if o.method == "path-trace" else asdict(load_model(o.device))
+        content = [self.store.key(MANY_BOUNCES), o.samples, o.method, dict(sorted(o.settings.items())), o.repeats]
+        content += [o.device, o.threads, commit(), model, budget]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:24]
+
+    @cached_property
+    def truth(self) -> Reference | None:
+        """None where no error is measured."""
+        return self.store.get(MANY_BOUNCES) if self.options.samples else None
+
+    @cached_property
+    def plate(self) -> np.ndarray:
+        """For all frames; kernels are compiled by then."""
+        from warp_dvct.relighter import Relighter
+
+        o = self.options
+        small = Relighter(self.scene, method=o.method, width=48, device=o.device, threads=o.threads)
+        small.render(np.full((small.height, 48, 3), 0.5, np.float32))
+        return self.truth.before if self.truth else np.full((self.size["height"], o.width, 3), 0.5, np.float32)
+
+    def measure(self, key: str, budget: float) -> dict[str, Any]:
+        """The row of a budget."""
+        size = {"width": self.size["width"], "height": self.size["height"]}
+        row: dict[str, Any] = {"kind": KIND, "key": key, "stage": self.name, **size, "budget": budget}
+        row |= {"method": self.options.method, "settings": self.options.settings}
         try:
-            tries = [_keep(scene, budget, plate, options, size) for _ in range(options.repeats)]
+            tries = [
+                _keep(self.scene, budget, self.plate, self.options, self.size) for _ in range(self.options.repeats)
+            ]
         except OptionError as error:
-            rows.append({**row, "budget": budget, "refused": str(error)})
-            report(rows[-1])
-            continue
+            return {**row, "refused": str(error)}
         middle = sorted(tries, key=lambda t: t["seconds"])[len(tries) // 2]
         comp = middle.pop("comp")
         flip = None
-        if truth is not None:
-            flip = math.sqrt(max(flip_ldr(truth.comp, comp)[0] ** 2 - truth.noise**2, 0.0))
-        rows.append({**row, "budget": budget, **middle, "flip": flip})
-        report(rows[-1])
-    return rows
+        if self.truth is not None:
+            flip = math.sqrt(max(flip_ldr(self.truth.comp, comp)[0] ** 2 - self.truth.noise**2, 0.0))
+        return {**row, **middle, "flip": flip}
 
 
 def _keep(scene: Any, budget: float, plate: np.ndarray, options: BudgetOptions, size: dict[str, Any]) -> dict[str, Any]:

@@ -124,26 +124,33 @@ def tradeoff(stages: tuple[str, ...], pairs: tuple[str, ...], cache: Path | None
 @click.option("--spp", "samples", type=int, default=96, show_default=True, help="Of the truth; 0 measures no error.")
 @click.option("--seed", type=int, default=1, show_default=True, help="Of the truth's random numbers.")
 @click.option("--cache", type=FILE, help="References; default: warp_dvct in the user's cache.")
-@click.option("--out", type=FILE, metavar="FILE", help="Add the rows to this file of JSON lines.")
+@click.option("--out", type=FILE, metavar="FILE", help="Add each row to this file of JSON lines at once.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda:N.")
 @click.option("--threads", type=int, help="CPU threads; all cores by default.")
 def budget(stages: tuple[str, ...], pairs: tuple[str, ...], cache: Path | None, out: Path | None, **rest: Any) -> None:
-    """Budgets against actual times, and predicted against measured errors: whether relight --budget keeps its word."""
+    """Budgets against actual times, and predicted against measured errors: whether relight --budget keeps its word.
+
+    A run that was stopped goes on where --out ends: rows of the same commit and unit costs, marked ·, are kept.
+    """
     start_warp(rest["device"])
     from warp_dvct.bench import budget as module
     from warp_dvct.bench.error import LIT_STAGES
-    from warp_dvct.bench.rows import append_row, provenance, read_rows
+    from warp_dvct.bench.rows import append_row, now, provenance, read_rows
 
-    if out is not None:
-        read_rows(out)
+    # A commit with a + does not say what was measured.
+    written = read_rows(out, module.KIND) if out is not None else []
+    known = {row["key"]: row for row in written if "key" in row and not str(row.get("commit")).endswith("+")}
     options = module.BudgetOptions(settings=settings_of(pairs), cache=cache or cache_folder() / "references", **rest)
     taken, rows = provenance(), []
+
+    def add(row: dict[str, Any], known: bool) -> None:
+        click.echo(module.format_row(row) + " ·" * known)
+        if out is not None and not known:
+            append_row(out, {**row, **taken, "time": now()})
+
     click.echo(module.HEAD)
     for stage in stages or LIT_STAGES:
-        rows += module.measure(stage, options, lambda row: click.echo(module.format_row(row)))
-    if out is not None:
-        for row in rows:
-            append_row(out, {**row, **taken})
+        rows += module.measure(stage, options, add, known)
     click.echo(module.summarise(rows))
 
 

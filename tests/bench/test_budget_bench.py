@@ -69,6 +69,44 @@ def test_a_tiny_room_keeps_a_budget(tmp_path, monkeypatch):
     assert "of 1 budgets" in result.output
 
 
+def test_a_stopped_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    """Each row is in the file before the next is measured; rows of the same commit are not measured again, those of
+    changed sources are."""
+    measured, file = [], tmp_path / "rows.jsonl"
+    stop_at, sources = [3.0], ["abc"]
+    predicted = row(1.0)["predicted"]
+
+    def keep(scene, budget, plate, options, size):
+        if budget == stop_at[0]:
+            raise KeyboardInterrupt
+        measured.append(budget)
+        return {**{k: row(budget)[k] for k in ("seconds", "cpu_seconds")}, "predicted": predicted, "comp": None}
+
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    monkeypatch.setattr(module, "_keep", keep)
+    monkeypatch.setattr(module, "commit", lambda: sources[0])
+    monkeypatch.setattr("warp_dvct.bench.rows.commit", lambda: sources[0])
+    words = ["budget", "--stage", "colour_bleeding", "--width", "48", "--spp", "0", "--out", str(file)]
+    budgets = [word for budget in (1, 2, 3, 4) for word in ("--budget", str(budget))]
+
+    def run() -> str:
+        return CliRunner().invoke(bench, [*words, *budgets]).output
+
+    assert "·" not in run()
+    assert [r["budget"] for r in read_rows(file, "budget")] == measured == [1.0, 2.0]
+    stop_at[0] = 0.0
+    output = run()
+    assert output.count("·") == 2
+    assert "of 4 budgets" in output
+    assert [r["budget"] for r in read_rows(file, "budget")] == measured == [1.0, 2.0, 3.0, 4.0]
+    for commit, repeated in (("abc", 0), ("abd", 4), ("abd+", 4), ("abd+", 4)):
+        sources[0] = commit
+        before = len(measured)
+        run()
+        assert len(measured) - before == repeated, commit
+    assert len({r["key"] for r in read_rows(file, "budget")}) == 12
+
+
 @pytest.mark.parametrize("budget", ["0", "-1", "nan", "inf"])
 def test_what_is_no_budget_is_refused_before_the_work(budget, tmp_path, monkeypatch):
     monkeypatch.setattr(module.ReferenceStore, "of", None)  # a truth would take its time
