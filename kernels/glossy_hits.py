@@ -60,7 +60,7 @@ def domes_in_lobe(geo: Geometry, env: Environment, s: Surface, wo: wp.vec3) -> S
     sent = Sent()
     direction = wp.normalize(s.normal * (2.0 * wp.dot(s.normal, wo)) - wo)
     if env.levels > 0 and wp.dot(direction, s.normal_g) > 0.0:
-        sight = look(geo, spawn_point(s, direction), direction, FAR, 1, True)
+        sight = look(geo, spawn_point(s, direction), direction, FAR, True, True)
         # Directions spread by twice the normals' slope.
         solid_angle = PI * 4.0 * s.alpha * s.alpha
         weight = fresnel(s.f0, s.f90, wp.dot(s.normal, wo))
@@ -103,7 +103,7 @@ def lights_in_lobe(
                 f *= power_share(light.pdf, vndf_pdf(s, wo, light.direction))
             if wp.max(f[0], wp.max(f[1], f[2])) > faint:
                 reach = light.distance * SHADOW_END
-                sight = look(geo, spawn_point(s, light.direction), light.direction, reach, with_before, True)
+                sight = look(geo, spawn_point(s, light.direction), light.direction, reach, real_before, True)
                 sent.after += f * sight.after
                 if real_before:
                     sent.before += f * sight.before
@@ -112,7 +112,7 @@ def lights_in_lobe(
             if met.pdf > 0.0:
                 f = wp.cw_mul(bounce_weight, met.radiance) * power_share(bounce_density, met.pdf)
                 if wp.max(f[0], wp.max(f[1], f[2])) > faint:
-                    sight = look(geo, origin, bounce, met.distance * SHADOW_END, with_before, True)
+                    sight = look(geo, origin, bounce, met.distance * SHADOW_END, real_before, True)
                     sent.after += f * sight.after
                     if real_before:
                         sent.before += f * sight.before

@@ -83,8 +83,11 @@ def highlight_weight(s: Surface, wo: wp.vec3, light: LightSample, direct: Direct
 @wp.func
 def beyond(normal: wp.vec3, toward: wp.vec3, extent: wp.vec3) -> bool:
     """Whether a box is wholly on the positive side of a plane through a point; ``toward`` leads to its middle."""
-    nearest = wp.dot(toward, normal) - wp.dot(extent, wp.abs(normal))
-    return nearest > BOX_MARGIN * wp.length(normal) * (wp.length(toward) + wp.length(extent))
+    across = wp.abs(normal)
+    size = wp.abs(toward) + extent
+    # Sums of components instead of lengths: never less, and no roots.
+    margin = (across[0] + across[1] + across[2]) * (size[0] + size[1] + size[2]) * BOX_MARGIN
+    return wp.dot(toward, normal) - wp.dot(extent, across) > margin
 
 
 @wp.func
@@ -153,7 +156,7 @@ def reflected(s: Surface, wo: wp.vec3, light: LightSample, direct: Direct) -> wp
 
 @wp.struct
 class Part:
-    """One light at one point: after on synthetic points, after - before on real ones; and before."""
+    """One light at one point: after, or after - before and before."""
 
     light: wp.vec3
     before: wp.vec3
@@ -168,17 +171,19 @@ class Sight:
 
 
 @wp.func
-def look(geo: Geometry, origin: wp.vec3, direction: wp.vec3, reach: float, need_before: int, shadowed: bool) -> Sight:
-    """Trace the objects first: where they do not shadow and nobody asks for 'before', both are equal."""
-    sight = Sight()
-    blocked = False
+def look(geo: Geometry, origin: wp.vec3, direction: wp.vec3, reach: float, before: bool, shadowed: bool) -> Sight:
+    """Trace a shadow ray. ``before`` is as ``after`` unless asked for: what objects hide then needs no second ray."""
+    blocked = bool(False)
     if shadowed:
         blocked = occluded_by_synthetic(geo, origin, direction, reach)
-    sight.before = 1.0
-    if blocked or need_before != 0:
-        if occluded_by_real(geo, origin, direction, reach):
-            sight.before = 0.0
-    sight.after = wp.where(blocked, 0.0, sight.before)
+    hidden = bool(False)
+    if before or not blocked:
+        hidden = occluded_by_real(geo, origin, direction, reach)
+    sight = Sight()
+    sight.after = wp.where(blocked or hidden, 0.0, 1.0)
+    sight.before = sight.after
+    if before:
+        sight.before = wp.where(hidden, 0.0, 1.0)
     return sight
 
 
@@ -222,26 +227,50 @@ def drawn_light(lights: Lights, k: int, s: Surface, draw: Draw, count: int, dire
 
 
 @wp.func
-def untouched(s: Surface, wo: wp.vec3, draw: Draw, geo: Geometry, lights: Lights, k: int, direct: Direct) -> bool:
-    """Whether the probes of ``light_part`` meet no synthetic object: the light then does not change, to the last bit.
+def light_taken(s: Surface, wo: wp.vec3, draw: Draw, geo: Geometry, lights: Lights, k: int, direct: Direct) -> wp.vec3:
+    """The light of one lamp that synthetic objects take from a real surface.
 
-    Most real points are such, and for them this leaves out the unshadowed light of every sample.
+    Samples that no object blocks take nothing, so neither their light nor what is behind them is asked for. The first
+    few decide, as in ``light_part``: where none is blocked, or all are and real surfaces treat them alike, the others
+    are not traced.
     """
+    taken = wp.vec3(0.0, 0.0, 0.0)
     lit = bool(False)
+    passed = int(0)
+    blocked = int(0)
+    seen = int(0)
+    samples = int(draw.samples)
+    tracing = bool(True)
     count = int(0)
-    while count < draw.probes:
+    while count < samples:
         light = drawn_light(lights, k, s, draw, count, direct)
-        if not lit:
-            f = reflected(s, wo, light, direct)
-            lit = wp.max(f[0], wp.max(f[1], f[2])) > 0.0
         origin = spawn_point(s, light.direction)
         reach = light.distance * SHADOW_END
-        if occluded_by_synthetic(geo, origin, light.direction, reach):
-            return False
+        meets = bool(True)
+        if tracing:
+            meets = occluded_by_synthetic(geo, origin, light.direction, reach)
+        if not meets:
+            passed += 1
+        if meets or not lit:
+            f = reflected(s, wo, light, direct)
+            if wp.max(f[0], wp.max(f[1], f[2])) > 0.0:
+                lit = True
+                if meets:
+                    blocked += 1
+                    hidden = bool(False)
+                    if tracing:
+                        hidden = occluded_by_real(geo, origin, light.direction, reach)
+                    if not hidden:
+                        seen += 1
+                        taken += f
         count += 1
         if light.pdf <= 0.0:
-            return True
-    return lit
+            samples = 1  # a light without extent: every sample is this one
+        elif count == draw.probes and lit:
+            if blocked == 0 or (passed == 0 and seen == 0):
+                return wp.vec3(0.0, 0.0, 0.0)
+            tracing = passed > 0 or seen < blocked
+    return taken / float(samples)
 
 
 @wp.func
@@ -249,22 +278,16 @@ def light_part(
     draw: Draw,
     s: Surface,
     wo: wp.vec3,
-    role: int,
     geo: Geometry,
     lights: Lights,
     k: int,
     direct: Direct,
-    added: bool,
+    both: bool,
     shadowed: bool,
 ) -> Part:
-    """One light by shadow rays. The first few decide: where they agree the light is wholly seen or hidden, and the rest
-    of the samples only integrate the unshadowed light; where they do not, all samples are traced."""
-    delta_only = role != SYNTHETIC and not added
-    need_before = int(1)
-    if delta_only and direct.with_before == 0:
-        need_before = 0
-        if untouched(s, wo, draw, geo, lights, k, direct):
-            return Part()
+    """One light by shadow rays: after, or (``both``) before and what is between them. The first few decide: where they
+    agree the light is wholly seen or hidden, and the rest of the samples only integrate the unshadowed light; where
+    they do not, all samples are traced."""
     open = wp.vec3(0.0, 0.0, 0.0)
     sum_before = wp.vec3(0.0, 0.0, 0.0)
     sum_after = wp.vec3(0.0, 0.0, 0.0)
@@ -279,14 +302,8 @@ def light_part(
         f = reflected(s, wo, light, direct)
         open += f
         if tracing and wp.max(f[0], wp.max(f[1], f[2])) > 0.0:
-            sight = look(
-                geo,
-                spawn_point(s, light.direction),
-                light.direction,
-                light.distance * SHADOW_END,
-                need_before,
-                shadowed,
-            )
+            origin = spawn_point(s, light.direction)
+            sight = look(geo, origin, light.direction, light.distance * SHADOW_END, both, shadowed)
             sum_before += f * sight.before
             sum_after += f * sight.after
             seen_before += sight.before
@@ -305,11 +322,10 @@ def light_part(
         sum_after = open * (seen_after / n)
     part = Part()
     scale = 1.0 / float(samples)
-    if delta_only:
+    part.light = sum_after * scale
+    if both:
         part.before = sum_before * scale
         part.light = (sum_after - sum_before) * scale
-    else:
-        part.light = sum_after * scale
     return part
 
 
@@ -355,10 +371,13 @@ def _shade_direct(
         if lights.kind[k] != DOME and not unlit(lights, k, s.position, s.normal_g):
             added = lights.role[k] == ADDED
             shadowed = may_shadow(geo, lights, k, s.position)
-            if role == SYNTHETIC or added or direct.with_before != 0 or shadowed:
-                part = light_part(draw, s, wo, role, geo, lights, k, direct, added, shadowed)
+            whole = role == SYNTHETIC or added
+            if whole or direct.with_before != 0:
+                part = light_part(draw, s, wo, geo, lights, k, direct, not whole, shadowed)
                 total += part.light
                 before += part.before
+            elif shadowed:
+                total -= light_taken(s, wo, draw, geo, lights, k, direct)
     light_out[i] = total
     if direct.with_before != 0:
         before_out[i] = before

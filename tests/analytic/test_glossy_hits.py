@@ -11,6 +11,7 @@ from warp_dvct.passes.gather import Gatherer, gather_all, glossy_hits
 from warp_dvct.passes.injection import empty_flux, inject
 from warp_dvct.passes.patches import bounce_field
 from warp_dvct.passes.rsm import render_rsm
+from warp_dvct.relighter import Relighter
 from warp_dvct.scene import Light, LightKind, Material, Role, Scene
 
 COUNT = 240
@@ -73,3 +74,23 @@ def test_a_glossy_floor_lights_the_wall_that_its_lobe_points_at(launcher, roughn
 
 def test_matt_scenes_need_none_of_it(launcher):
     assert glossy_hits(launcher, glossy_room(0.9), lit.upload(launcher, glossy_room(0.9)), None, 0) is None
+
+
+@pytest.mark.parametrize(("method", "roughness"), [("delta-cones", 1.0), ("instant-radiosity", 0.25)])
+def test_a_synthetic_mirror_shows_no_lamp_through_a_real_wall(method, roughness):
+    """A chrome plate beside a floor, and the only lamp behind a wall: what floors gather, or reflect, of the plate used
+    to hold the lamp's highlight, since only objects were asked whether they hide it."""
+    floor = lit.mesh(lit.rectangle((0.5, 0, 0), (2, 0, 0), (0, 0, -2)), Role.REAL, 0)
+    wall = lit.mesh(lit.rectangle((-0.9, 3, 0), (0, 0, -6), (0, 6, 0)), Role.REAL, 0)
+    plate = lit.mesh(lit.rectangle((1, 0.6, 0), (0, 0, -0.5), (0, 0.5, 0))[:, ::-1], Role.SYNTHETIC, 1)
+    lamp = Light(LightKind.RECT, (5.0, 5.0, 5.0), (-1, 2.5, 0), (0, 0, 1.5), (0, 1.5, 0), direction=(1, 0, 0))
+    materials = (
+        Material(base_color=(0.5, 0.5, 0.5), roughness=roughness, metallic=float(roughness < 1.0)),
+        Material(base_color=(0.9, 0.9, 0.9), roughness=0.15, metallic=1.0),
+    )
+    camera = lit.look_at((-0.5, 1, 0), (0.5, 0, 0), half=0.4, aspect=4 / 3)
+    scene = lit.scene_of(floor, wall, plate, lights=(lamp,), materials=materials, camera=camera)
+    seen = Relighter(scene, method=method, width=32, height=24, settings={"bounces": 1, "visibility": "ray"}).render()
+    assert seen.mask_synthetic.any()
+    assert not seen.plate.any()
+    assert not seen.comp.any()
