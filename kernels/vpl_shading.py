@@ -365,24 +365,32 @@ def _shade_glossy(
             origin = spawn_point(s, direction)
             real = trace_real(geo, origin, direction, FAR)
             synthetic = trace_synthetic(geo, origin, direction, real.t)
-            share_after = wp.where(synthetic.found != 0, 0, 1)
             seen = Pair()
             seen.before = wp.vec3(0.0, 0.0, 0.0)
             seen.after = wp.vec3(0.0, 0.0, 0.0)
-            if real.found != 0 and glossy.again != 0 and (share_after != 0 or is_real != 0):
-                met = surface_at(geo, mats, real, origin, direction)
-                seen = lit_surface(
-                    geo, lights, env, vpls, sight, met, -direction, is_real, share_after, glossy, j, 2 * k
-                )
-            elif real.found == 0 and env.levels > 0:
+            if real.found == 0 and env.levels > 0:
                 seen.before = environment_radiance(env, direction, 1.0 / density, 0)
-                seen.after = environment_radiance(env, direction, 1.0 / density, 1)
-            if synthetic.found != 0:
-                seen.after = wp.vec3(0.0, 0.0, 0.0)
-            if synthetic.found != 0 and glossy.again != 0:
-                met = surface_at(geo, mats, synthetic, origin, direction)
-                inserted = lit_surface(geo, lights, env, vpls, sight, met, -direction, 0, 1, glossy, j, 2 * k + 1)
-                seen.after = inserted.after
+                if synthetic.found == 0:
+                    seen.after = environment_radiance(env, direction, 1.0 / density, 1)
+            if glossy.again != 0:
+                hits = int(2)  # one call in a loop at run time: two would spill on GPUs
+                for n in range(hits):
+                    hit = real
+                    want_before = is_real
+                    want_after = wp.where(synthetic.found != 0, 0, 1)
+                    if n == 1:
+                        hit = synthetic
+                        want_before = 0
+                        want_after = 1
+                    if hit.found != 0 and (want_before != 0 or want_after != 0):
+                        met = surface_at(geo, mats, hit, origin, direction)
+                        sent = lit_surface(
+                            geo, lights, env, vpls, sight, met, -direction, want_before, want_after, glossy, j, 2 * k + n
+                        )
+                        if want_before != 0:
+                            seen.before = sent.before
+                        if want_after != 0:
+                            seen.after = sent.after
             lamps = lights_along(lights, origin, direction, synthetic.t, density, samples, 1)
             after += wp.cw_mul(weight, seen.after + lamps)
             if is_real != 0:
