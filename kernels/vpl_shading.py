@@ -327,6 +327,59 @@ def lit_surface(
     return out
 
 
+@wp.func
+def seen_along(
+    geo: Geometry,
+    mats: Materials,
+    lights: Lights,
+    env: Environment,
+    vpls: Vpls,
+    sight: Sight,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    density: float,
+    glossy: Glossy,
+    is_real: int,
+    index: int,
+    sample: int,
+) -> Pair:
+    """Radiance along a glossy ray; ``before`` is 0 where the ray starts on a synthetic surface.
+
+    ``density`` is that of all rays together, per solid angle.
+    """
+    seen = Pair()
+    real = trace_real(geo, origin, direction, FAR)
+    synthetic = trace_synthetic(geo, origin, direction, real.t)
+    hits = int(2)  # one call in a loop at run time: two would spill on GPUs
+    for n in range(hits):
+        hit = real
+        want_before = is_real
+        want_after = wp.where(synthetic.found != 0, 0, 1)
+        if n == 1:
+            hit = synthetic
+            want_before = 0
+            want_after = 1
+        if hit.found != 0 and glossy.again != 0 and (want_before != 0 or want_after != 0):
+            s = surface_at(geo, mats, hit, origin, direction)
+            sent = lit_surface(
+                geo, lights, env, vpls, sight, s, -direction, want_before, want_after, glossy, index, 2 * sample + n
+            )
+            if want_before != 0:
+                seen.before = sent.before
+            if want_after != 0:
+                seen.after = sent.after
+    if real.found == 0 and env.levels > 0:
+        if is_real != 0:
+            seen.before = environment_radiance(env, direction, 1.0 / density, 0)
+        if synthetic.found == 0:
+            seen.after = environment_radiance(env, direction, 1.0 / density, 1)
+    samples = float(glossy.light_samples)
+    seen.after += lights_along(lights, origin, direction, synthetic.t, density, samples, 1)
+    if is_real != 0:
+        seen.before += lights_along(lights, origin, direction, real.t, density, samples, 0)
+    return seen
+
+
 @wp.kernel
 def _shade_glossy(
     first: int,
@@ -360,42 +413,11 @@ def _shade_glossy(
         pdf = vndf_pdf(s, wo, direction)
         if wp.dot(direction, s.normal_g) > 0.0 and pdf > 0.0:
             weight = brdf_cos_specular(s, wo, direction) / pdf
-            density = pdf * float(glossy.rays)
-            samples = float(glossy.light_samples)
             origin = spawn_point(s, direction)
-            real = trace_real(geo, origin, direction, FAR)
-            synthetic = trace_synthetic(geo, origin, direction, real.t)
-            seen = Pair()
-            seen.before = wp.vec3(0.0, 0.0, 0.0)
-            seen.after = wp.vec3(0.0, 0.0, 0.0)
-            if real.found == 0 and env.levels > 0:
-                seen.before = environment_radiance(env, direction, 1.0 / density, 0)
-                if synthetic.found == 0:
-                    seen.after = environment_radiance(env, direction, 1.0 / density, 1)
-            if glossy.again != 0:
-                hits = int(2)  # one call in a loop at run time: two would spill on GPUs
-                for n in range(hits):
-                    hit = real
-                    want_before = is_real
-                    want_after = wp.where(synthetic.found != 0, 0, 1)
-                    if n == 1:
-                        hit = synthetic
-                        want_before = 0
-                        want_after = 1
-                    if hit.found != 0 and (want_before != 0 or want_after != 0):
-                        met = surface_at(geo, mats, hit, origin, direction)
-                        sent = lit_surface(
-                            geo, lights, env, vpls, sight, met, -direction, want_before, want_after, glossy, j, 2 * k + n
-                        )
-                        if want_before != 0:
-                            seen.before = sent.before
-                        if want_after != 0:
-                            seen.after = sent.after
-            lamps = lights_along(lights, origin, direction, synthetic.t, density, samples, 1)
-            after += wp.cw_mul(weight, seen.after + lamps)
-            if is_real != 0:
-                lamps = lights_along(lights, origin, direction, real.t, density, samples, 0)
-                before += wp.cw_mul(weight, seen.before + lamps)
+            density = pdf * float(glossy.rays)
+            seen = seen_along(geo, mats, lights, env, vpls, sight, origin, direction, density, glossy, is_real, j, k)
+            after += wp.cw_mul(weight, seen.after)
+            before += wp.cw_mul(weight, seen.before)
     after = after / float(glossy.rays)
     before = before / float(glossy.rays)
     light_out[j] += after - before
