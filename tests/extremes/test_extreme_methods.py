@@ -2,28 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import lit_scenes as lit
 import numpy as np
 import pytest
-from extreme_scenes import assert_same, ball, numbers, room
-from test_extreme_places import STAGE
+from extreme_scenes import ball, numbers, room
 
 from warp_dvct.scene import Role
-
-
-@pytest.mark.parametrize(("metres", "scale", "shift"), [(1e-6, 1, 0), (1e6, 1, 0), (1, 1e6, 0), (1, 1, 1e7)])
-@pytest.mark.parametrize("method", ["cones", "ism", "path"])
-def test_units_and_transforms_of_a_stage(tmp_path: Path, method, metres, scale, shift):
-    """``metersPerUnit``, the root's scale and its place: the same picture, to what float32 points leave."""
-    pictures = []
-    for number, values in enumerate([(1, 1, 0), (metres, scale, shift)]):
-        file = tmp_path / f"{number}.usda"
-        file.write_text(STAGE.format(metres=values[0], scale=values[1], shift=values[2]))
-        pictures.append(numbers(str(file), method, height=None).picture)
-    assert pictures[0].mean() > 0.05
-    assert_same(pictures[1], pictures[0], mean=2e-3)
 
 
 @pytest.mark.parametrize("method", ["cones", "vpl-rays", "path"])

@@ -105,10 +105,15 @@ def Xform "World"
 """
 
 
+FAR_APART = [(1e-6, 1, 0), (1e6, 1, 0), (1, 1e6, 0), (1, 1, 1e7)]
+MORE_CHANGES = [(1, 1e-6, 0), (1e-3, 1e3, 0)]
+
+
 @pytest.mark.parametrize(
-    ("metres", "scale", "shift"), [(1e-6, 1, 0), (1e6, 1, 0), (1, 1e-6, 0), (1, 1e6, 0), (1e-3, 1e3, 0), (1, 1, 1e7)]
+    ("method", "metres", "scale", "shift"),
+    [(method, *change) for method in ("rays", "vpl-rays", "cones", "ism", "path") for change in FAR_APART]
+    + [(method, *change) for method in ("rays", "vpl-rays") for change in MORE_CHANGES],
 )
-@pytest.mark.parametrize("method", ["rays", "vpl-rays"])
 def test_units_and_transforms_of_a_stage(tmp_path: Path, method, metres, scale, shift):
     """``metersPerUnit`` and the root's scale from 1e-6 to 1e6, and its translation by 1e7 m: the same picture."""
     pictures = []
