@@ -356,6 +356,31 @@ def map_texel(ism: Ism, start: int, x: int, y: int) -> float:
     return ism.inverse[start + wp.clamp(y, 0, ism.size - 1) * ism.size + wp.clamp(x, 0, ism.size - 1)]
 
 
+@wp.struct
+class Texels:
+    """The four texels around a place, row by row, and the way from the first to the next along x and y, 0 to 1."""
+
+    inverse: wp.vec4
+    way: wp.vec2
+
+
+@wp.func
+def texels_around(ism: Ism, start: int, place: Place) -> Texels:
+    x = place.x - 0.5
+    y = place.y - 0.5
+    x0 = int(wp.floor(x))
+    y0 = int(wp.floor(y))
+    texels = Texels()
+    texels.way = wp.vec2(x - float(x0), y - float(y0))
+    texels.inverse = wp.vec4(
+        map_texel(ism, start, x0, y0),
+        map_texel(ism, start, x0 + 1, y0),
+        map_texel(ism, start, x0, y0 + 1),
+        map_texel(ism, start, x0 + 1, y0 + 1),
+    )
+    return texels
+
+
 @wp.func
 def inverse_at(ism: Ism, start: int, place: Place) -> float:
     """Inverse depth in a map: interpolated over one surface, the farthest of four texels across its edge.
@@ -363,20 +388,11 @@ def inverse_at(ism: Ism, start: int, place: Place) -> float:
     Where a surface is seen at a grazing angle its depth falls from infinity to near within a texel; the farthest keeps
     it from hiding itself.
     """
-    x = place.x - 0.5
-    y = place.y - 0.5
-    x0 = int(wp.floor(x))
-    y0 = int(wp.floor(y))
-    fx = x - float(x0)
-    fy = y - float(y0)
-    a = map_texel(ism, start, x0, y0)
-    b = map_texel(ism, start, x0 + 1, y0)
-    c = map_texel(ism, start, x0, y0 + 1)
-    d = map_texel(ism, start, x0 + 1, y0 + 1)
-    low = wp.min(wp.min(a, b), wp.min(c, d))
-    high = wp.max(wp.max(a, b), wp.max(c, d))
-    if low >= high * SAME_SURFACE:
-        return wp.lerp(wp.lerp(a, b, fx), wp.lerp(c, d, fx), fy)
+    texels = texels_around(ism, start, place)
+    v = texels.inverse
+    low = wp.min(v)
+    if low >= wp.max(v) * SAME_SURFACE:
+        return wp.lerp(wp.lerp(v[0], v[1], texels.way[0]), wp.lerp(v[2], v[3], texels.way[0]), texels.way[1])
     return low
 
 
@@ -384,22 +400,16 @@ def inverse_at(ism: Ism, start: int, place: Place) -> float:
 def open_share(ism: Ism, start: int, place: Place) -> float:
     """Share of a point's light that passes what a map shows. Of four texels, those that show nothing count by their
     area, as edges and holes do; the others as in ``inverse_at``."""
-    x = place.x - 0.5
-    y = place.y - 0.5
-    x0 = int(wp.floor(x))
-    y0 = int(wp.floor(y))
-    fx = x - float(x0)
-    fy = y - float(y0)
+    texels = texels_around(ism, start, place)
     shown = float(0.0)
     inverse = float(0.0)
     low = float(0.0)
     high = float(0.0)
     for k in range(4):
-        dx = k % 2
-        dy = k / 2
-        value = map_texel(ism, start, x0 + dx, y0 + dy)
+        value = texels.inverse[k]
         if value > 0.0:
-            weight = wp.where(dx == 1, fx, 1.0 - fx) * wp.where(dy == 1, fy, 1.0 - fy)
+            x_share = wp.where(k % 2 == 1, texels.way[0], 1.0 - texels.way[0])
+            weight = x_share * wp.where(k / 2 == 1, texels.way[1], 1.0 - texels.way[1])
             shown += weight
             inverse += value * weight
             low = wp.where(high > 0.0, wp.min(low, value), value)
