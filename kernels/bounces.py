@@ -311,27 +311,29 @@ def shown_area(
     return total
 
 
+@wp.struct
+class Side:
+    """A face of a record."""
+
+    record: wp.int32
+    face: wp.int32
+    center: wp.vec3  # of its voxel
+    axis: wp.vec3  # outward
+
+
 @wp.func
 def shown_position(
-    geo: Geometry,
-    normals: wp.array(dtype=wp.vec3),
-    pieces: Fragments,
-    field: BounceField,
-    record: int,
-    face: int,
-    center: wp.vec3,
-    axis: wp.vec3,
-    role: int,
+    geo: Geometry, normals: wp.array(dtype=wp.vec3), pieces: Fragments, field: BounceField, side: Side, role: int
 ) -> wp.vec3:
     """Where what a role shows on a record's face gets its light: at the middle of the voxel or, where a thin wall parts
     the two, on the largest piece. One side of a wall is often in another room than that middle."""
-    position = center
+    position = side.center
     if field.has_walls != 0:
-        fragment = largest_fragment(geo, normals, pieces, record, face, role)
+        fragment = largest_fragment(geo, normals, pieces, side.record, side.face, role)
         if fragment >= 0:
             place = fragment_position(pieces, fragment)
-            point = off_surface(field, place, axis)
-            if is_parted(wall_beside(field, point), point, center):
+            point = off_surface(field, place, side.axis)
+            if is_parted(wall_beside(field, point), point, side.center):
                 position = place
     return position
 
@@ -346,34 +348,26 @@ class Received:
 
 @wp.func
 def received(
-    geo: Geometry,
-    normals: wp.array(dtype=wp.vec3),
-    pieces: Fragments,
-    field: BounceField,
-    record: int,
-    face: int,
-    center: wp.vec3,
-    axis: wp.vec3,
-    role: int,
+    geo: Geometry, normals: wp.array(dtype=wp.vec3), pieces: Fragments, field: BounceField, side: Side, role: int
 ) -> Received:
     """What a role's surfaces behind a record's face get; where there are several sheets, its largest piece tells which
     one that is."""
     result = Received()
-    position = shown_position(geo, normals, pieces, field, record, face, center, axis, role)
-    home = home_of(field, position, axis, role)
+    position = shown_position(geo, normals, pieces, field, side, role)
+    home = home_of(field, position, side.axis, role)
     if home.several != 0:
-        fragment = largest_fragment(geo, normals, pieces, record, face, role)
+        fragment = largest_fragment(geo, normals, pieces, side.record, side.face, role)
         position = fragment_position(pieces, fragment)
-        home = home_of(field, position, axis, role)
-        voxel = record_of(field, off_surface(field, position, axis)) - field.level_first
+        home = home_of(field, position, side.axis, role)
+        voxel = record_of(field, off_surface(field, position, side.axis)) - field.level_first
         if home.several != 0 and voxel >= 0:
             lift = LIFT * field.volume.voxel * float(1 << field.level)
-            look = outlook(geo, normals, pieces, fragment, face, 0.0, lift)
-            head = field.table[voxel * 6 + face]
-            own = seen_patch(geo, field, head, home.own[face / 2], look.eye, role)
-            home.own[face / 2] = own
+            look = outlook(geo, normals, pieces, fragment, side.face, 0.0, lift)
+            head = field.table[voxel * 6 + side.face]
+            own = seen_patch(geo, field, head, home.own[side.face / 2], look.eye, role)
+            home.own[side.face / 2] = own
             result.buried = field.patches[own].buried
-    result.light = bounced_at_home(field, position, axis, home)
+    result.light = bounced_at_home(field, position, side.axis, home)
     return result
 
 
@@ -409,8 +403,11 @@ def _reinject(
     for face in range(faces):
         area = area_in[i * 6 + face]
         if area[1] > 0.0:
-            axis = wp.vec3(0.0, 0.0, 0.0)
-            axis[face / 2] = wp.where((face & 1) == 0, 1.0, -1.0)
+            side = Side()
+            side.record = i
+            side.face = face
+            side.center = center
+            side.axis[face / 2] = wp.where((face & 1) == 0, 1.0, -1.0)
             before = wp.vec3(0.0, 0.0, 0.0)
             after = wp.vec3(0.0, 0.0, 0.0)
             real_share = wp.where(has_real, 1.0, 0.0)
@@ -419,17 +416,17 @@ def _reinject(
                     real = shown_area(geo, normal_in, pieces, i, face, 0)
                     real_share = real / wp.max(real + shown_area(geo, normal_in, pieces, i, face, 1), 1.0e-20)
                 if real_share > 0.0:
-                    got = received(geo, normal_in, pieces, field, i, face, center, axis, 0)
+                    got = received(geo, normal_in, pieces, field, side, 0)
                     before = wp.cw_mul(albedo_in[2 * i], got.light.before)
                     if got.buried != 0 and real_share < 1.0:
                         real_share = 0.0
                     after = wp.cw_mul(albedo_in[2 * i], got.light.after) * real_share
                 if real_share < 1.0:
-                    added = received(geo, normal_in, pieces, field, i, face, center, axis, 1)
+                    added = received(geo, normal_in, pieces, field, side, 1)
                     after += wp.cw_mul(albedo_in[2 * i + 1], added.light.after) * (1.0 - real_share)
             else:
-                position = shown_position(geo, normal_in, pieces, field, i, face, center, axis, 0)
-                light = bounced_irradiance(field, position, axis, 0)
+                position = shown_position(geo, normal_in, pieces, field, side, 0)
+                light = bounced_irradiance(field, position, side.axis, 0)
                 before = wp.cw_mul(albedo_in[2 * i], light.before)
                 after = wp.cw_mul(albedo_in[2 * i], light.after)
             flux_out[(i * 6 + face) * 2] += before * area[0]
