@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -77,28 +78,31 @@ def read_stage(
 
     stage = open_stage(path)
     with quiet_diagnostics():
-        metres, frame = world_frame(stage)
         code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(time)
-        ctx = Context(stage, code, metres, frame, levels=refinement_levels(complexity))
+        ctx = Context(stage, code, *world_frame(stage), levels=refinement_levels(complexity))
         note_composition_errors(stage, ctx.notices)
-        broken = ctx.notices.all()
-        try:
+        with _naming(ctx.notices.all()):
             eye = None if view is not None else choose_camera(ctx, camera)
             found = Collector(ctx, Roles(ctx, real, synthetic, render_pass), tuple(purposes)).collect()
             _require(stage, found, allow_empty_roles, allow_no_light)
             if eye is not None:
                 view, plate = conform(read_camera(eye, ctx), ctx), read_plate(eye, ctx, plate)
             assert view is not None
-            photograph = None if plate is None else os.fspath(plate)
-            scene = _assemble(ctx, view, photograph, found, images or ImageCache())
-        except StageError as error:
-            if not broken:
-                raise
-            # What is missing is often in the file that did not load.
-            raise StageError(f"{error} ({_list(broken)})") from error
+            scene = _assemble(ctx, view, plate, found, images or ImageCache())
     if strict and scene.notices:
         raise StageError(f"{name_of(stage)}: --strict, and this is not modelled: {_list(scene.notices)}")
     return scene
+
+
+@contextmanager
+def _naming(broken: Sequence[Notice]) -> Iterator[None]:
+    """Add what did not load to an error's message: what is missing is often in that file."""
+    try:
+        yield
+    except StageError as error:
+        if not broken:
+            raise
+        raise StageError(f"{error} ({_list(broken)})") from error
 
 
 def _require(stage: Usd.Stage, found: Collection, allow_empty_roles: bool, allow_no_light: bool) -> None:
@@ -108,7 +112,9 @@ def _require(stage: Usd.Stage, found: Collection, allow_empty_roles: bool, allow
         raise StageError(f"{name_of(stage)} has no light; add a UsdLux light")
 
 
-def _assemble(ctx: Context, camera: Camera, plate: str | None, found: Collection, images: ImageCache) -> Scene:
+def _assemble(
+    ctx: Context, camera: Camera, plate: str | os.PathLike | None, found: Collection, images: ImageCache
+) -> Scene:
     """Read everything that the walk found."""
     materials = Materials(ctx, images)
     meshes, clouds = _GeometryBuilder(ctx, materials).build(found.geometry)
@@ -124,7 +130,7 @@ def _assemble(ctx: Context, camera: Camera, plate: str | None, found: Collection
         textures=tuple(materials.textures),
         lights=tuple(lights),
         camera=camera,
-        plate=plate,
+        plate=None if plate is None else os.fspath(plate),
         notices=ctx.notices.all(),
         point_clouds=tuple(clouds),
     )
