@@ -18,7 +18,7 @@ import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kept import Kept, content_key
-from warp_dvct.kernels import cones, radiosity, shading, specular
+from warp_dvct.kernels import cones, radiosity, specular
 from warp_dvct.kernels.volume import Volume
 from warp_dvct.launch import Launcher
 from warp_dvct.layers import Radiance
@@ -38,7 +38,7 @@ from warp_dvct.passes.patches import bounce_field, choose_patches
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
 from warp_dvct.passes.resolve import resolve
 from warp_dvct.passes.rsm import render_real, render_rsm
-from warp_dvct.passes.shading import shade_direct
+from warp_dvct.passes.shading import direct_settings, shade_direct
 from warp_dvct.passes.specular import find_glossy, shade_specular
 from warp_dvct.passes.voxels import Voxels, cut_triangles, part, voxelize
 from warp_dvct.plan import Plan
@@ -318,14 +318,7 @@ def _cone(plan: Plan, aperture: float = 0.0) -> Any:
 
 def _shade_direct(launcher: Launcher, device_scene: DeviceScene, plan: Plan, world: Any, part: _Part) -> None:
     settings = plan.settings
-    direct = shading.Direct()
-    direct.samples = settings.shadows_samples
-    direct.edge_samples = max(1, settings.antialias)
-    direct.probes = min(settings.shadows_probes, settings.shadows_samples)
-    direct.glossy = settings.glossy_rays if plan.glossy and settings.glossy == "rays" else 0
-    direct.alpha_max = plan.alpha_max
-    direct.with_before = int(part.with_before)
-    direct.seed = settings.seed
+    rays = settings.glossy_rays if plan.glossy and settings.glossy == "rays" else 0
     cone = None
     if settings.shadows == "cone":
         cone = _cone(plan)
@@ -335,7 +328,7 @@ def _shade_direct(launcher: Launcher, device_scene: DeviceScene, plan: Plan, wor
         device_scene,
         part.points,
         part.count,
-        direct,
+        direct_settings(plan, glossy_rays=rays, with_before=part.with_before),
         light=part.light,
         before=part.before,
         world=world,

@@ -16,7 +16,7 @@ import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kept import content_key
-from warp_dvct.kernels import shading, specular
+from warp_dvct.kernels import specular
 from warp_dvct.kernels.vpls import Vpls
 from warp_dvct.launch import Launcher
 from warp_dvct.layers import Radiance
@@ -27,7 +27,7 @@ from warp_dvct.passes.history import Blender, History
 from warp_dvct.passes.ism import draw_isms, new_isms, ray_sight
 from warp_dvct.passes.point_cloud import SurfacePoints, sample_surfaces
 from warp_dvct.passes.resolve import resolve
-from warp_dvct.passes.shading import shade_direct
+from warp_dvct.passes.shading import direct_settings, shade_direct
 from warp_dvct.passes.specular import find_glossy
 from warp_dvct.passes.vpl_bounces import bounce_vpls
 from warp_dvct.passes.vpl_memory import check_memory
@@ -382,8 +382,11 @@ class _Shader:
 
     def _direct(self, points: Any, count: int, light: Any, before: Any) -> None:
         """Direct light of all but domes (eqs. 1-5)."""
-        direct = direct_settings(self.plan, self.scene, self.device_scene, self.with_before)
-        if self.plan.settings.shadow_maps == "single":
+        plan, settings = self.plan, self.plan.settings
+        shown = plan.glossy and (settings.bounces or has_dome(self.scene.lights))
+        rays = settings.glossy_rays if shown else 0
+        direct = direct_settings(plan, glossy_rays=rays, with_before=self.with_before)
+        if settings.shadow_maps == "single":
             shade_direct_single(
                 self.launcher,
                 self.device_scene,
@@ -417,20 +420,6 @@ def first_vpls(vpls: Any, count: int) -> Any:
         setattr(fewer, name, getattr(vpls, name))
     fewer.count = count
     return fewer
-
-
-def direct_settings(plan: Plan, scene: Scene, device_scene: DeviceScene, with_before: bool) -> Any:
-    """``kernels.shading.Direct`` for exact shadow rays."""
-    settings = plan.settings
-    direct = shading.Direct()
-    direct.samples = settings.shadows_samples
-    direct.edge_samples = max(1, settings.antialias)
-    direct.probes = min(settings.shadows_probes, settings.shadows_samples)
-    direct.glossy = settings.glossy_rays if plan.glossy and (settings.bounces or has_dome(scene.lights)) else 0
-    direct.alpha_max = plan.alpha_max
-    direct.with_before = int(with_before)
-    direct.seed = settings.seed
-    return direct
 
 
 def has_dome(lights: tuple[Light, ...]) -> bool:

@@ -7,6 +7,25 @@ from typing import Any
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import shading as kernels
 from warp_dvct.launch import Launcher
+from warp_dvct.plan import Plan
+
+
+def direct_settings(plan: Plan, *, glossy_rays: int, with_before: bool) -> Any:
+    """``kernels.shading.Direct`` of a plan.
+
+    Args:
+        glossy_rays: With which the specular pass shares the highlights; 0 where it traces none.
+    """
+    settings = plan.settings
+    direct = kernels.Direct()
+    direct.samples = settings.shadows_samples
+    direct.edge_samples = max(1, settings.antialias)
+    direct.probes = min(settings.shadows_probes, settings.shadows_samples)
+    direct.glossy = glossy_rays
+    direct.alpha_max = plan.alpha_max
+    direct.with_before = int(with_before)
+    direct.seed = settings.seed
+    return direct
 
 
 def shade_direct(
