@@ -7,6 +7,7 @@ work on element ``first + wp.tid()``; each writes only what that element owns, s
 
 from __future__ import annotations
 
+import copy
 import os
 import time
 import weakref
@@ -89,13 +90,18 @@ class Launcher:
         """Launch in slabs of ``slab`` elements; the processor seconds of all."""
         assert self._pool is not None
         waiting = deque(range(0, count, slab))
+        begun = time.thread_time()
+        command = wp.launch(
+            kernel, dim=slab, inputs=[0, *inputs], outputs=list(outputs), device=self.device, record_cmd=True
+        )
+        packing = time.thread_time() - begun
         # This thread works too: a thread that only waits leaves its core last, and of those it woke two may share one.
         workers = [
-            self._pool.submit(self._launch_slabs, kernel, waiting, slab, count, inputs, outputs)
+            self._pool.submit(_launch_slabs, _another(command), waiting, slab, count)
             for _ in range(min(self.threads, len(waiting)) - 1)
         ]
         try:
-            own = self._launch_slabs(kernel, waiting, slab, count, inputs, outputs)
+            own = packing + _launch_slabs(command, waiting, slab, count)
             return own + sum(worker.result() for worker in workers)
         finally:
             # After an interrupt the caller frees its arrays: no slab may still be writing to them.
@@ -126,24 +132,6 @@ class Launcher:
         with wp.Tape() as tape:
             self._launch_slab(kernel, 0, count, inputs, outputs)
         tape.backward(grads=seeds)
-
-    def _launch_slabs(self, kernel, waiting: deque[int], slab: int, count: int, inputs, outputs) -> float:
-        """Take slabs until none is left; the processor seconds that took.
-
-        A recorded launch costs a fifth of a new one, and both hold Python's lock.
-        """
-        begun = time.thread_time()
-        command: Any = wp.launch(
-            kernel, dim=slab, inputs=[0, *inputs], outputs=list(outputs), device=self.device, record_cmd=True
-        )
-        while True:
-            try:
-                start = waiting.popleft()
-            except IndexError:
-                return time.thread_time() - begun
-            command.set_param_at_index(0, start)
-            command.set_dim(min(slab, count - start))
-            command.launch()
 
     def _launch_slab(self, kernel, first, count, inputs, outputs) -> None:
         wp.launch(kernel, dim=count, inputs=[first, *inputs], outputs=list(outputs), device=self.device)
@@ -260,3 +248,23 @@ def find_device(name: str) -> Any:
     if name not in present:
         raise DeviceError(f"device '{name}' is not present; present: {', '.join(present)}")
     return wp.get_device(name)
+
+
+def _launch_slabs(command: Any, waiting: deque[int], slab: int, count: int) -> float:
+    """Replay a recorded launch for slabs until none is left; the processor seconds that took."""
+    begun = time.thread_time()
+    while True:
+        try:
+            start = waiting.popleft()
+        except IndexError:
+            return time.thread_time() - begun
+        command.set_param_at_index(0, start)
+        command.set_dim(min(slab, count - start))
+        command.launch()
+
+
+def _another(command: Any) -> Any:
+    """The same recorded launch for another thread: packing its arguments anew would hold Python's lock again."""
+    other = copy.copy(command)
+    other.params, other.fwd_args = list(command.params), list(command.fwd_args)
+    return other
