@@ -5,16 +5,18 @@ import warp as wp
 from warp_dvct.kernels.bounce_field import BounceField, bounced_irradiance
 from warp_dvct.kernels.cones import ConeSettings
 from warp_dvct.kernels.environment import environment_radiance
-from warp_dvct.kernels.gather import cone_incident, diffuse_reflectance, ray_incident
+from warp_dvct.kernels.gather import cone_incident, diffuse_reflectance, hit_incident, ray_incident
 from warp_dvct.kernels.gbuffer import BACKGROUND, UNSEEN, Points, first_sample, load_surface, share_of
 from warp_dvct.kernels.geometry import (
     FAR,
     Geometry,
+    Hit,
     occluded_by_real,
     occluded_by_synthetic,
     trace_real,
     trace_synthetic,
 )
+from warp_dvct.kernels.glossy_hits import FOCUSING
 from warp_dvct.kernels.lights import ADDED, DOME, Lights, light_along_ray, sample_light
 from warp_dvct.kernels.materials import (
     Materials,
@@ -32,7 +34,8 @@ from warp_dvct.kernels.shading import SHADOW_END, power_share, reflect_visible, 
 wp.set_module_options({"enable_backward": False})
 
 
-# A GGX alpha from which on a lobe blurs what it shows by more than the voxels do: its rays read their radiosity.
+# A GGX alpha from which on a lobe blurs what it shows by more than the voxels do: its rays read their radiosity, but
+# for surfaces that focus.
 BLURRED = wp.constant(0.1)
 
 
@@ -131,6 +134,15 @@ def shade_hit(
 
 
 @wp.func
+def focuses(geo: Geometry, mats: Materials, hit: Hit) -> bool:
+    """Whether the surface met has a lobe too narrow for its radiosity to stand for what it sends along a ray."""
+    m = geo.material[hit.triangle]
+    narrow = mats.roughness_texture[m] >= 0 or mats.roughness[m] * mats.roughness[m] <= FOCUSING
+    f0 = mats.f0[m]
+    return narrow and (mats.metallic[m] > 0.0 or wp.max(f0[0], wp.max(f0[1], f0[2])) > 0.0)
+
+
+@wp.func
 def reflected_along(
     geo: Geometry,
     mats: Materials,
@@ -141,54 +153,47 @@ def reflected_along(
     direction: wp.vec3,
     density: float,
     glossy: Glossy,
+    blurred: bool,
     with_before: int,
     index: int,
     sample: int,
 ) -> Incident:
-    """Radiance along a reflected ray, before and after, with the share of the lights that is the ray's."""
+    """Radiance along a reflected ray, before and after, with the share of the lights that is the ray's.
+
+    Surfaces met are shaded by the lights; for a ``blurred`` ray the voxels' radiosity stands for those that spread
+    their light.
+    """
     result = Incident()
     real = trace_real(geo, origin, direction, FAR)
     synthetic = trace_synthetic(geo, origin, direction, real.t)
     samples = float(glossy.light_samples)
     rays = density * float(glossy.rays)
-    result.before = lights_along(lights, origin, direction, real.t, rays, samples, 0)
-    result.after = lights_along(lights, origin, direction, synthetic.t, rays, samples, 1)
-    if real.found != 0 and (with_before != 0 or synthetic.found == 0):
+    shade_real = real.found != 0 and (with_before != 0 or synthetic.found == 0)
+    shade_synthetic = synthetic.found != 0
+    if blurred:
+        result = hit_incident(world, real, synthetic, origin, direction, 1.0 / rays)
+        result.before = result.before * INV_PI
+        result.after = result.after * INV_PI
+        if shade_real:
+            shade_real = focuses(geo, mats, real)
+        if shade_synthetic:
+            shade_synthetic = focuses(geo, mats, synthetic)
+    elif real.found == 0:
+        result.before = environment_radiance(world.env, direction, 1.0 / rays, 0)
+        result.after = environment_radiance(world.env, direction, 1.0 / rays, 1)
+    if shade_real:
         s = surface_at(geo, mats, real, origin, direction)
         seen = shade_hit(geo, world, bounces, lights, s, -direction, glossy, with_before, index, sample)
-        result.before += seen.before
+        result.before = seen.before
         if synthetic.found == 0:
-            result.after += seen.after
-    if synthetic.found != 0:
+            result.after = seen.after
+    if shade_synthetic:
         s = surface_at(geo, mats, synthetic, origin, direction)
         seen = shade_hit(geo, world, bounces, lights, s, -direction, glossy, 0, index, sample)
-        result.after += seen.after
-    if real.found == 0:
-        result.before += environment_radiance(world.env, direction, 1.0 / rays, 0)
-        if synthetic.found == 0:
-            result.after += environment_radiance(world.env, direction, 1.0 / rays, 1)
+        result.after = seen.after
+    result.before += lights_along(lights, origin, direction, real.t, rays, samples, 0)
+    result.after += lights_along(lights, origin, direction, synthetic.t, rays, samples, 1)
     return result
-
-
-@wp.func
-def blurred_along(
-    geo: Geometry,
-    world: World,
-    lights: Lights,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    density: float,
-    glossy: Glossy,
-) -> Incident:
-    """As ``reflected_along``, from the voxels' radiosity where the ray ends."""
-    rays = density * float(glossy.rays)
-    light = ray_incident(world, geo, origin, direction, 1.0 / rays)
-    samples = float(glossy.light_samples)
-    light.before = light.before * INV_PI
-    light.after = light.after * INV_PI
-    light.before += lights_along(lights, origin, direction, light.distance_before, rays, samples, 0)
-    light.after += lights_along(lights, origin, direction, light.distance_after, rays, samples, 1)
-    return light
 
 
 @wp.kernel
@@ -221,13 +226,10 @@ def _shade_specular_rays(
         if wp.dot(direction, s.normal_g) > 0.0 and density > 0.0:
             weight = brdf_cos_specular(s, wo, direction) / density
             origin = spawn_point(s, direction)
-            light = Incident()
-            if s.alpha >= BLURRED:
-                light = blurred_along(geo, world, lights, origin, direction, density, glossy)
-            else:
-                light = reflected_along(
-                    geo, mats, world, bounces, lights, origin, direction, density, glossy, 1 - s.synthetic, 0, k
-                )
+            blurred = s.alpha >= BLURRED
+            light = reflected_along(
+                geo, mats, world, bounces, lights, origin, direction, density, glossy, blurred, 1 - s.synthetic, 0, k
+            )
             after += wp.cw_mul(weight, light.after)
             if s.synthetic == 0:
                 before += wp.cw_mul(weight, light.before)

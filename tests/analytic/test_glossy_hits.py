@@ -94,3 +94,23 @@ def test_a_synthetic_mirror_shows_no_lamp_through_a_real_wall(method, roughness)
     assert seen.mask_synthetic.any()
     assert not seen.plate.any()
     assert not seen.comp.any()
+
+
+def test_a_blurred_reflection_of_a_glossy_floor_is_not_that_of_a_matt_one():
+    """A metal card over a metal floor that a spot lights from above: hardly any of that light goes to the card. Rays of
+    lobes wide enough to read voxels took the floor's radiosity for it, which shines to all sides."""
+    floor = lit.mesh(lit.rectangle((0, 0, 0), (3, 0, 0), (0, 0, -3)), Role.REAL, 0)
+    card = lit.mesh(lit.rectangle((0, 0.7, 0), (0.4, 0, 0), (0, 0.3, 0)), Role.SYNTHETIC, 1)
+    spot = Light(LightKind.POINT, (30.0, 30.0, 30.0), (0, 4, 1.0), direction=(0, -1, 0), cone_angle=0.5)
+    materials = (
+        Material(base_color=(0.8, 0.8, 0.8), roughness=0.25, metallic=1.0),
+        Material(base_color=(0.9, 0.9, 0.9), roughness=0.35, metallic=1.0),
+    )
+    camera = lit.look_at((0, 0.7, 2.5), (0, 0.7, 0), half=0.15, aspect=4 / 3)
+    scene = lit.scene_of(floor, card, lights=(spot,), materials=materials, camera=camera)
+    truth, seen = (
+        Relighter(scene, method=method, width=32, height=24, settings={"bounces": 1, **settings}).render()
+        for method, settings in (("path-trace", {"samples": 512}), ("delta-cones", {"glossy.rays": 64}))
+    )
+    whole = truth.mask_synthetic == 1.0
+    assert seen.comp[whole].mean() == pytest.approx(truth.comp[whole].mean(), rel=0.1)
