@@ -131,8 +131,9 @@ def agreement(
     rows = []
     for count in points:
         cloud = sample_surfaces(launcher, device_scene, region, block=count, blocks=values.ism_blocks, seed=values.seed)
-        maps = new_isms(launcher, lights.vpls.count, size=values.ism_size, bias=values.ism_bias, region=region)
-        draw_isms(launcher, maps, lights.vpls, cloud, 0, lights.vpls.count, grow=values.ism_grow)
+        sky, count_all = lights.ends[0], lights.vpls.count
+        maps = new_isms(launcher, count_all - sky, size=values.ism_size, bias=values.ism_bias, first=sky)
+        draw_isms(launcher, maps, lights.vpls, cloud, sky, count_all - sky, grow=values.ism_grow)
         rows.append(
             Row(
                 count,

@@ -2,8 +2,8 @@
 
 Ritschel et al. 2008, "Imperfect Shadow Maps for Efficient Computation of Indirect Illumination", with the splats
 aligned to their surfaces and the pair per VPL of Knecht et al. 2012. Maps hold inverse depth, 0 where nothing is: it is
-nearly linear over a plane's image, so it can be interpolated and averaged. A VPL on the sky has an orthographic map of
-the lit region instead.
+nearly linear over a plane's image, so it can be interpolated and averaged. VPLs on the sky have no maps: through a hole
+in one the sky would come into a closed room, and exact rays towards them cost no more than drawing the maps.
 """
 
 import warp as wp
@@ -26,14 +26,13 @@ from warp_dvct.kernels.materials import (
     surface_at,
 )
 from warp_dvct.kernels.sampling import sobol2, tangent_of
-from warp_dvct.kernels.vpls import SKY, Vpls
+from warp_dvct.kernels.vpls import Vpls
 
 wp.set_module_options({"enable_backward": False})
 
 RAY_END = wp.constant(0.9999)  # of the way to a VPL, whose own surface is not in its way
 STEEPEST = wp.constant(1.0e-3)  # cosine at which a splat is seen edge-on and left out
 WIDEST = wp.constant(3.0)  # largest angle from the map's axis that a splat's outline is followed to [rad]
-SKY_BIAS = wp.constant(0.5)  # of the bias is taken in orthographic maps, in radii of their region
 OVERHANG = wp.constant(3.0)  # distance in radii up to which the back of a splat is taken for an overhang
 FILLED = wp.constant(0.7)  # share of covered texels from which a coarse texel fills the holes inside of it
 # Which answers of a visibility test are needed.
@@ -83,15 +82,14 @@ class Pieces:
 
 @wp.struct
 class Ism:
-    """Maps of all VPLs: that of VPL k and role r begins at ``(2 k + r) * stride``; coarse levels follow the finest."""
+    """Maps of the VPLs from ``first`` on, two each, that of real points before that of synthetic ones; coarse levels
+    follow the finest."""
 
+    first: wp.int32
     size: wp.int32
     levels: wp.int32  # that pull-push uses, the finest included
     stride: wp.int32
     bias: wp.float32  # relative depth by which a blocker must be nearer than the receiver
-    center: wp.vec3  # region of the orthographic maps
-    radius: wp.float32
-    far: wp.float32  # height above the region's centre at which depth is 0 in them, in radii
     inverse: wp.array(dtype=wp.float32)
 
 
@@ -99,7 +97,7 @@ class Ism:
 class Sight:
     """How visibility is found."""
 
-    rays: wp.int32  # 1: exact rays, 0: imperfect shadow maps
+    rays: wp.int32  # 1: exact rays, 0: imperfect shadow maps, but rays towards the sky
     single: wp.int32  # 1: one map of the nearest surface of either role, as in 2010
     ism: Ism
 
@@ -125,14 +123,6 @@ def place_in_map(vpls: Vpls, k: int, ism: Ism, position: wp.vec3) -> Place:
     """Continuous texel coordinates, and what a blocker's inverse depth there has to exceed."""
     out = Place()
     half = 0.5 * float(ism.size)
-    if vpls.kind[k] == SKY:
-        p = local_to(position - ism.center, vpls.normal[k]) / ism.radius
-        depth = ism.far - p[2] - SKY_BIAS * ism.bias
-        if wp.max(wp.abs(p[0]), wp.abs(p[1])) < 1.0 and depth > 0.0:
-            out.x = (p[0] + 1.0) * half
-            out.y = (p[1] + 1.0) * half
-            out.limit = 1.0 / depth
-        return out
     v = local_to(position - vpls.position[k], vpls.normal[k])
     d = wp.length(v)
     if v[2] > 0.0:
@@ -254,35 +244,11 @@ def splat(ism: Ism, start: int, v: wp.vec3, m: wp.vec3, radius: float):
                         ism.inverse[at] = wp.max(ism.inverse[at], 1.0 / depth)
 
 
-@wp.func
-def splat_flat(ism: Ism, start: int, v: wp.vec3, m: wp.vec3, radius: float):
-    """Draw a disc into an orthographic map; lengths in radii of the region."""
-    half = 0.5 * float(ism.size)
-    r = radius * half
-    cx = (v[0] + 1.0) * half
-    cy = (v[1] + 1.0) * half
-    if wp.abs(m[2]) <= STEEPEST:
-        return
-    x0 = wp.max(int(wp.floor(cx - r)), 0)
-    x1 = wp.min(int(wp.floor(cx + r)), ism.size - 1)
-    y0 = wp.max(int(wp.floor(cy - r)), 0)
-    y1 = wp.min(int(wp.floor(cy + r)), ism.size - 1)
-    for y in range(y0, y1 + 1):
-        t = (float(y) + 0.5) / half - 1.0
-        for x in range(x0, x1 + 1):
-            s = (float(x) + 0.5) / half - 1.0
-            height = v[2] - ((s - v[0]) * m[0] + (t - v[1]) * m[1]) / m[2]
-            d = wp.vec3(s, t, height) - v
-            if wp.length_sq(d) <= radius * radius and height < ism.far:
-                at = start + y * ism.size + x
-                ism.inverse[at] = wp.max(ism.inverse[at], 1.0 / (ism.far - height))
-
-
 @wp.kernel
 def _splat_points(first: int, map_first: int, vpls: Vpls, real: Cloud, synthetic: Cloud, grow: float, ism: Ism):
     """One map, all by one thread: the points of the VPL's block, as discs grown by ``grow``."""
     i = map_first + first + wp.tid()
-    k = i / 2
+    k = ism.first + i / 2
     cloud = real
     if i % 2 == 1:
         cloud = synthetic
@@ -294,15 +260,11 @@ def _splat_points(first: int, map_first: int, vpls: Vpls, real: Cloud, synthetic
     for j in range(offset, offset + cloud.block):
         radius = cloud.radius[j] * grow
         m = local_to(cloud.normal[j], axis)
-        if vpls.kind[k] == SKY:
-            v = local_to(cloud.position[j] - ism.center, axis) / ism.radius
-            splat_flat(ism, start, v, m, radius / ism.radius)
-        else:
-            v = local_to(cloud.position[j] - vpls.position[k], axis)
-            # A disc reaches beyond a convex edge. Where it hangs over the VPL its back shows, and it would hide all.
-            overhangs = wp.dot(v, m) > 0.0 and wp.length_sq(v) < OVERHANG * OVERHANG * radius * radius
-            if v[2] > -radius and not overhangs:
-                splat(ism, start, v, m, radius)
+        v = local_to(cloud.position[j] - vpls.position[k], axis)
+        # A disc reaches beyond a convex edge. Where it hangs over the VPL its back shows, and it would hide all.
+        overhangs = wp.dot(v, m) > 0.0 and wp.length_sq(v) < OVERHANG * OVERHANG * radius * radius
+        if v[2] > -radius and not overhangs:
+            splat(ism, start, v, m, radius)
 
 
 @wp.func
@@ -356,31 +318,6 @@ def map_texel(ism: Ism, start: int, x: int, y: int) -> float:
     return ism.inverse[start + wp.clamp(y, 0, ism.size - 1) * ism.size + wp.clamp(x, 0, ism.size - 1)]
 
 
-@wp.struct
-class Texels:
-    """The four texels around a place, row by row, and the way from the first to the next along x and y, 0 to 1."""
-
-    inverse: wp.vec4
-    way: wp.vec2
-
-
-@wp.func
-def texels_around(ism: Ism, start: int, place: Place) -> Texels:
-    x = place.x - 0.5
-    y = place.y - 0.5
-    x0 = int(wp.floor(x))
-    y0 = int(wp.floor(y))
-    texels = Texels()
-    texels.way = wp.vec2(x - float(x0), y - float(y0))
-    texels.inverse = wp.vec4(
-        map_texel(ism, start, x0, y0),
-        map_texel(ism, start, x0 + 1, y0),
-        map_texel(ism, start, x0, y0 + 1),
-        map_texel(ism, start, x0 + 1, y0 + 1),
-    )
-    return texels
-
-
 @wp.func
 def inverse_at(ism: Ism, start: int, place: Place) -> float:
     """Inverse depth in a map: interpolated over one surface, the farthest of four texels across its edge.
@@ -388,49 +325,33 @@ def inverse_at(ism: Ism, start: int, place: Place) -> float:
     Where a surface is seen at a grazing angle its depth falls from infinity to near within a texel; the farthest keeps
     it from hiding itself.
     """
-    texels = texels_around(ism, start, place)
-    v = texels.inverse
-    low = wp.min(v)
-    if low >= wp.max(v) * SAME_SURFACE:
-        return wp.lerp(wp.lerp(v[0], v[1], texels.way[0]), wp.lerp(v[2], v[3], texels.way[0]), texels.way[1])
+    x = place.x - 0.5
+    y = place.y - 0.5
+    x0 = int(wp.floor(x))
+    y0 = int(wp.floor(y))
+    fx = x - float(x0)
+    fy = y - float(y0)
+    a = map_texel(ism, start, x0, y0)
+    b = map_texel(ism, start, x0 + 1, y0)
+    c = map_texel(ism, start, x0, y0 + 1)
+    d = map_texel(ism, start, x0 + 1, y0 + 1)
+    low = wp.min(wp.min(a, b), wp.min(c, d))
+    high = wp.max(wp.max(a, b), wp.max(c, d))
+    if low >= high * SAME_SURFACE:
+        return wp.lerp(wp.lerp(a, b, fx), wp.lerp(c, d, fx), fy)
     return low
 
 
 @wp.func
-def open_share(ism: Ism, start: int, place: Place) -> float:
-    """Share of a point's light that passes what a map shows. Of four texels, those that show nothing count by their
-    area, as edges and holes do; the others as in ``inverse_at``."""
-    texels = texels_around(ism, start, place)
-    shown = float(0.0)
-    inverse = float(0.0)
-    low = float(0.0)
-    high = float(0.0)
-    for k in range(4):
-        value = texels.inverse[k]
-        if value > 0.0:
-            x_share = wp.where(k % 2 == 1, texels.way[0], 1.0 - texels.way[0])
-            weight = x_share * wp.where(k / 2 == 1, texels.way[1], 1.0 - texels.way[1])
-            shown += weight
-            inverse += value * weight
-            low = wp.where(high > 0.0, wp.min(low, value), value)
-            high = wp.max(high, value)
-    if low >= high * SAME_SURFACE:
-        low = inverse / wp.max(shown, 1.0e-12)
-    return wp.where(low > place.limit, 1.0 - shown, 1.0)
-
-
-@wp.func
 def map_sight(vpls: Vpls, k: int, sight: Sight, position: wp.vec3) -> wp.vec2:
-    """How far VPL k sees a point past real surfaces (x), and past synthetic ones (y), by its two maps: 1 or 0; a share
-    where the VPL is on the sky, whose maps have no horizon at which surfaces would hide themselves."""
+    """Whether VPL k sees a point past real surfaces (x), and past synthetic ones (y), by its two maps: 1 or 0."""
     ism = sight.ism
     place = place_in_map(vpls, k, ism, position)
     if place.limit <= 0.0:
         return wp.vec2(1.0, 1.0)
-    if vpls.kind[k] == SKY and sight.single == 0:
-        return wp.vec2(open_share(ism, 2 * k * ism.stride, place), open_share(ism, (2 * k + 1) * ism.stride, place))
-    real = inverse_at(ism, 2 * k * ism.stride, place)
-    synthetic = inverse_at(ism, (2 * k + 1) * ism.stride, place)
+    start = 2 * (k - ism.first) * ism.stride
+    real = inverse_at(ism, start, place)
+    synthetic = inverse_at(ism, start + ism.stride, place)
     s_real = wp.where(real > place.limit, 0.0, 1.0)
     s_synthetic = wp.where(synthetic > place.limit, 0.0, 1.0)
     if sight.single != 0 and s_synthetic == 0.0 and synthetic > real:

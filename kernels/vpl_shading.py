@@ -100,7 +100,7 @@ def vpl_irradiance(
     elif in_after and only_change != 0:
         need = CHANGE
     open = wp.vec2(1.0, 1.0)
-    if sight.rays != 0:
+    if sight.rays != 0 or vpls.kind[k] == SKY:
         ask_synthetic = wp.where(in_after, 1, 0)
         open = ray_sight(geo, sight, origin, toward.direction, toward.distance * RAY_END, ask_synthetic, need)
     else:
@@ -450,8 +450,8 @@ def _compare_sight(
     rays: Sight,
     pairs_out: wp.array(dtype=wp.vec4i),
 ):
-    """Pairs of a point and a VPL that face each other: all, those in which maps and rays agree in both solutions as
-    far as the pair is in them, those that only maps find blocked in one, and those that only rays do."""
+    """Pairs of a point and a VPL with maps that face each other: all, those in which maps and rays agree in both
+    solutions as far as the pair is in them, those that only maps find blocked in one, and those that only rays do."""
     i = first + wp.tid()
     total = wp.vec4i(0, 0, 0, 0)
     if points.role[i] != BACKGROUND:
@@ -459,9 +459,8 @@ def _compare_sight(
         origin = s.position + s.normal_g * (2.0e-6 * s.reach)
         for k in range(vpls.count):
             toward = toward_vpl(vpls, k, s, origin)
-            if toward.form > 0.0:
-                share = map_sight(vpls, k, maps, origin)
-                a = wp.vec2(wp.round(share[0]), wp.round(share[1]))
+            if toward.form > 0.0 and vpls.kind[k] != SKY:
+                a = map_sight(vpls, k, maps, origin)
                 b = ray_sight(geo, rays, origin, toward.direction, toward.distance * RAY_END, 1, ALL)
                 x = wp.vec2(a[0] * float(vpls.real[k]), wp.min(a[0], a[1]) * float(1 - vpls.hidden[k]))
                 y = wp.vec2(b[0] * float(vpls.real[k]), wp.min(b[0], b[1]) * float(1 - vpls.hidden[k]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from warp_dvct.cost import Counts, direct_work, draws, frame_work, tree_depth
-from warp_dvct.passes.vpl_memory import vpl_count
+from warp_dvct.passes.vpl_memory import surface_vpls, vpl_count
 from warp_dvct.settings import Settings
 from warp_dvct.survey import Survey
 
@@ -31,11 +31,13 @@ def count_vpl_work(settings: Settings, survey: Survey, width: int, height: int) 
     further = max(0, settings.bounces - 1)
     points = 2.0 * settings.ism_points * settings.ism_blocks * 1e-6  # real and synthetic
     passes["vpls"] = {"frame": 1, "vpls": count}
-    passes["point cloud"] = {"frame": 1, "points": points, "triangles": survey.triangles * 1e-6}
-    if settings.visibility == "ism":
-        splats, texels = 2.0 * count * settings.ism_points, count * settings.ism_size**2
+    maps = surface_vpls(settings) * 1e-6 if settings.visibility == "ism" else 0.0
+    if maps > 0.0 or further:
+        passes["point cloud"] = {"frame": 1, "points": points, "triangles": survey.triangles * 1e-6}
+    if maps > 0.0:
+        splats, texels = 2.0 * maps * settings.ism_points, maps * settings.ism_size**2
         # A splat is as large as its point's share of the surface: all of them together cover the map.
-        passes["ism"] = {"frame": 1, "maps": 1e6 * count, "splats": splats, "texels": texels}
+        passes["ism"] = {"frame": 1, "maps": 1e6 * maps, "splats": splats, "texels": texels}
     if further:
         candidates = further * points
         passes["vpl bounces"] = {"maps": further, "points": candidates, "met": candidates * survey.met}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from warp_dvct.passes.vpl_memory import CLOUD_BYTES, VPL_BYTES, map_texels, vpl_count
+from warp_dvct.passes.vpl_memory import CLOUD_BYTES, VPL_BYTES, map_texels, surface_vpls, vpl_count
 from warp_dvct.plan import LAYERED_PIXEL_BYTES, MAP_BYTES, POINT_BYTES, PassPlan
 from warp_dvct.scene import LightKind, Scene
 from warp_dvct.settings import Settings
@@ -29,7 +29,7 @@ def plan_passes(
     count = vpl_count(settings, dome=dome)
     needs_vpls = lit and count > 0
     no_vpls = idle if not lit else "bounces=0 and no dome: direct light only"
-    maps = needs_vpls and settings.visibility == "ism"
+    maps = lit and settings.bounces > 0 and settings.visibility == "ism"
     cloud = maps or (bounced and further > 0)
     tiles = settings.vpls_tiles
     single = settings.shadow_maps == "single"
@@ -59,8 +59,8 @@ def plan_passes(
         PassPlan(
             "ism",
             maps,
-            f"2 x {settings.ism_size}^2 a VPL" if maps else ("exact rays instead" if needs_vpls else no_vpls),
-            2 * 4 * count * map_texels(settings.ism_size),
+            f"2 x {settings.ism_size}^2 a VPL on surfaces" if maps else "exact rays instead" if needs_vpls else no_vpls,
+            2 * 4 * surface_vpls(settings) * map_texels(settings.ism_size),
         ),
         PassPlan(
             "bounces",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import lit_scenes as lit
 import numpy as np
 import pytest
 
@@ -186,7 +187,7 @@ def test_shadow_maps_agree_with_rays(launcher, stage):
     shares = [row.agreement.agree for row in rows]
     assert shares[2] >= 0.95
     assert shares == sorted(shares)
-    assert rows[0].agreement.pairs > 20_000
+    assert rows[0].agreement.pairs > 10_000
 
 
 def test_a_constant_dome_lights_open_ground_evenly(launcher):
@@ -197,9 +198,21 @@ def test_a_constant_dome_lights_open_ground_evenly(launcher):
     open_ground = Setup(launcher, floor, bounces=0)
     light = VplLight(open_ground.device_scene, lights.vpls, lights.sight, 1, with_before=True)
     before, after = (a.numpy() for a in light_picture(launcher, open_ground.buffer, light))
-    lit = open_ground.buffer.points.role.numpy() == Role.REAL
-    np.testing.assert_allclose(before[lit], np.pi * np.array([[1.0, 0.9, 0.8]]).repeat(lit.sum(), 0), rtol=0.01)
+    real = open_ground.buffer.points.role.numpy() == Role.REAL
+    np.testing.assert_allclose(before[real], np.pi * np.array([[1.0, 0.9, 0.8]]).repeat(real.sum(), 0), rtol=0.01)
     np.testing.assert_array_equal(before, after)
+
+
+def test_no_sky_comes_through_the_walls_of_a_closed_room():
+    """Maps of the sky had holes, and showed the surroundings of the objects alone: added domes lit whole rooms."""
+    walls = lit.mesh(lit.room(0.4))
+    crate = lit.mesh(lit.cuboid((0.5, 0.2, 0.5), 0.05), Role.SYNTHETIC)
+    camera = lit.look_at((0.5, 0.5, 0.85), (0.5, 0.3, 0.5))
+    for role in LightRole:
+        scene = lit.scene_of(walls, crate, lights=(Light(LightKind.DOME, (1.0, 1.0, 1.0), role=role),), camera=camera)
+        layers = Relighter(scene, method="instant-radiosity", width=24, height=24, settings={"bounces": 2}).render()
+        assert layers.mask_synthetic.any()
+        assert layers.comp.max() < 1e-3
 
 
 def test_a_sky_texture_lights_as_its_own_integral(launcher):
@@ -318,9 +331,8 @@ def test_a_light_that_meets_nothing_is_noted(launcher):
 
 
 def test_maps_that_do_not_fit_are_refused(launcher):
-    setup = Setup(launcher, scene_of(LIGHTS["spot"]))
     with pytest.raises(DeviceError, match=r"500000 VPLs at ism.size=2048 need .* VPLs would fit: lower vpls.count"):
-        new_isms(launcher, 500_000, size=2048, bias=0.1, region=setup.region)
+        new_isms(launcher, 500_000, size=2048, bias=0.1)
 
 
 @pytest.mark.parametrize(
@@ -383,7 +395,7 @@ def test_points_of_a_scan_cast_the_shadow_of_the_surface_they_were_taken_from(la
     assert set(map(tuple, cloud.real.position.numpy().round(4))) <= given
     for ours, theirs in ((cloud.real, drawn.real), (cloud.synthetic, drawn.synthetic)):
         assert ours.area.numpy().sum() == pytest.approx(theirs.area.numpy().sum(), rel=0.03)
-    maps = new_isms(launcher, lights.vpls.count, size=128, bias=0.08, region=setup.region)
+    maps = new_isms(launcher, lights.vpls.count, size=128, bias=0.08)
     draw_isms(launcher, maps, lights.vpls, cloud, 0, lights.vpls.count, grow=1.3)
     result = compare_sight(
         launcher, setup.device_scene, setup.buffer.points, setup.buffer.count, lights.vpls, maps, ray_sight(launcher)

@@ -30,7 +30,7 @@ from warp_dvct.passes.resolve import resolve
 from warp_dvct.passes.shading import direct_settings, shade_direct
 from warp_dvct.passes.specular import find_glossy
 from warp_dvct.passes.vpl_bounces import bounce_vpls
-from warp_dvct.passes.vpl_memory import check_memory
+from warp_dvct.passes.vpl_memory import check_memory, surface_vpls
 from warp_dvct.passes.vpl_shading import (
     VplLight,
     light_picture,
@@ -73,30 +73,28 @@ def make_vpls(launcher: Launcher, scene: Scene, device_scene: DeviceScene, plan:
     region = lit_region(scene, device_scene, plan)
     env = build_environment(launcher, scene.lights)
     sky = settings.vpls_sky if env.levels else 0
-    further = max(0, settings.bounces - 1)
-    room = sky + (settings.vpls_count + further * settings.vpls_further if settings.bounces else 0)
+    maps = surface_vpls(settings)
+    vpls = new_vpls(launcher, sky + maps)
+    with launcher.scope("vpls"):
+        start = choose_sky(launcher, env, vpls, 0, sky, seed=settings.seed)
     single = settings.shadow_maps == "single"
     if settings.visibility == "ray":
         sight = ray_sight(launcher, single=single)
     else:
         with launcher.scope("ism"):
-            sight = new_isms(
-                launcher, room, size=settings.ism_size, bias=settings.ism_bias, region=region, single=single
-            )
-    vpls = new_vpls(launcher, room)
-    builder = _Builder(launcher, scene, device_scene, plan, region, vpls, sight)
-    with launcher.scope("vpls"):
-        builder.extend(choose_sky(launcher, env, vpls, 0, sky, seed=settings.seed), disc=False)
+            sight = new_isms(launcher, maps, size=settings.ism_size, bias=settings.ism_bias, first=start, single=single)
+    builder = _Builder(launcher, scene, device_scene, plan, region, vpls, sight, start)
     if settings.bounces:
         builder.first_bounce()
-    for bounce in range(further):
-        builder.next_bounce(bounce + 2)
+    for bounce in range(2, settings.bounces + 1):
+        builder.next_bounce(bounce)
     vpls.count = builder.ends[-1]
     return VplSet(vpls, sight, tuple(builder.ends), env, region, tuple(builder.notices))
 
 
 class _Builder:
-    """Fills the VPL buffer part by part; each part gets its shadow maps before the next one needs them."""
+    """Fills the VPL buffer part by part behind the ``sky`` VPLs; each part gets its shadow maps before the next one
+    needs them."""
 
     def __init__(
         self,
@@ -107,10 +105,11 @@ class _Builder:
         region: Region,
         vpls: Any,
         sight: Any,
+        sky: int,
     ) -> None:
         self.launcher, self.scene, self.device_scene, self.plan = launcher, scene, device_scene, plan
         self.region, self.vpls, self.sight = region, vpls, sight
-        self.ends: list[int] = []
+        self.ends = [sky]
         self.notices: list[Notice] = []
         self._points: SurfacePoints | None = None
 
@@ -131,12 +130,12 @@ class _Builder:
                 )
         return self._points
 
-    def extend(self, made: int, *, disc: bool = True) -> None:
-        """Take ``made`` VPLs into the set: their discs and their shadow maps."""
-        start = self.ends[-1] if self.ends else 0
+    def extend(self, made: int) -> None:
+        """Take ``made`` VPLs on surfaces into the set: their discs and their shadow maps."""
+        start = self.ends[-1]
         self.ends.append(start + made)
         settings = self.plan.settings
-        if made and disc:
+        if made:
             spread_vpls(self.launcher, self.vpls, start, made, scale=settings.vpls_clamp, region=self.region)
         if made and not self.sight.rays:
             points = self.points

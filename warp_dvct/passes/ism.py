@@ -11,15 +11,13 @@ from warp_dvct.kernels.ism import Ism, Sight
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.point_cloud import SurfacePoints
 from warp_dvct.passes.vpl_memory import check_isms, map_texels, pyramid_levels
-from warp_dvct.passes.vpls import Region
-
-SKY_REGION = 4.0  # radius of what the maps of the sky show, over that of the synthetic objects
 
 
-def new_isms(launcher: Launcher, count: int, *, size: int, bias: float, region: Region, single: bool = False) -> Any:
+def new_isms(launcher: Launcher, count: int, *, size: int, bias: float, first: int = 0, single: bool = False) -> Any:
     """Empty maps for ``count`` VPLs.
 
     Args:
+        first: The first of them: those on the sky, before it, have no maps.
         size: Texels an edge; holes are filled best in maps of a size that halves well.
         bias: Relative depth by which a blocker has to be nearer than what it shadows.
         single: Answer as one map of the nearest surface of either role would (the method of 2010).
@@ -30,11 +28,8 @@ def new_isms(launcher: Launcher, count: int, *, size: int, bias: float, region: 
     """
     check_isms(launcher, count, size)
     ism = Ism()
-    ism.size, ism.levels, ism.stride = size, pyramid_levels(size), map_texels(size)
+    ism.first, ism.size, ism.levels, ism.stride = first, size, pyramid_levels(size), map_texels(size)
     ism.bias = bias
-    # Maps of the sky show what is around the synthetic objects: farther off nothing changes by them.
-    ism.center, ism.radius = wp.vec3(*region.focus), min(region.radius, SKY_REGION * region.focus_radius)
-    ism.far = 1.0 + 2.0 * region.radius / ism.radius
     ism.inverse = launcher.zeros(max(1, 2 * count * ism.stride), wp.float32)
     return _sight(ism, rays=False, single=single)
 
@@ -42,13 +37,15 @@ def new_isms(launcher: Launcher, count: int, *, size: int, bias: float, region: 
 def draw_isms(
     launcher: Launcher, sight: Any, vpls: Any, points: SurfacePoints, start: int, count: int, *, grow: float
 ) -> None:
-    """Draw the two maps of each of ``count`` VPLs from ``start`` on (Ritschel et al. 2008, Knecht et al. 2012).
+    """Draw the two maps of each of ``count`` VPLs from ``start`` on, none of them on the sky.
+
+    Ritschel et al. 2008, Knecht et al. 2012.
 
     Args:
         grow: Radius of a splat, over that of the disc that a point stands for.
     """
     ism = sight.ism
-    maps, first = 2 * count, 2 * start
+    maps, first = 2 * count, 2 * (start - ism.first)
     launcher.launch(kernels._splat_points, maps, [first, vpls, points.real, points.synthetic, grow, ism])
     for level in range(1, ism.levels):
         launcher.launch(kernels._pull, maps * (ism.size >> level) ** 2, [first, ism, level], [ism.inverse])

@@ -25,11 +25,14 @@ def pyramid_levels(size: int) -> int:
     return min(FILL_LEVELS, max(0, (size & -size).bit_length() - 1)) + 1
 
 
+def surface_vpls(settings: Settings) -> int:
+    """VPLs of all bounces: those that have shadow maps."""
+    return settings.vpls_count + (settings.bounces - 1) * settings.vpls_further if settings.bounces else 0
+
+
 def vpl_count(settings: Settings, *, dome: bool) -> int:
     """VPLs of all bounces and, with a dome, on the sky."""
-    sky = settings.vpls_sky if dome else 0
-    further = max(0, settings.bounces - 1) * settings.vpls_further
-    return sky + (settings.vpls_count + further if settings.bounces else 0)
+    return surface_vpls(settings) + (settings.vpls_sky if dome else 0)
 
 
 def check_memory(launcher: Launcher, settings: Settings, *, lights: int, dome: bool) -> None:
@@ -56,7 +59,7 @@ def check_memory(launcher: Launcher, settings: Settings, *, lights: int, dome: b
             raise DeviceError(_message(what, bytes_of, free, fits) + "; lower ism.points too")
         raise DeviceError(_message(what, bytes_of, free, fits))
     if settings.visibility == "ism":
-        check_isms(launcher, count, settings.ism_size)
+        check_isms(launcher, surface_vpls(settings), settings.ism_size)
     needed = sum(bytes_of.values())
     if needed > free:
         raise DeviceError(
@@ -84,7 +87,7 @@ def check_isms(launcher: Launcher, count: int, size: int) -> None:
         fits = min(free // each, INDEX_LIMIT // 2 // map_texels(size))
         raise DeviceError(
             f"imperfect shadow maps of {count} VPLs at ism.size={size} need {needed / 2**20:.0f} MiB and"
-            f" {free / 2**20:.0f} MiB are free; {fits} VPLs would fit: lower vpls.count, vpls.further, vpls.sky,"
+            f" {free / 2**20:.0f} MiB are free; {fits} VPLs would fit: lower vpls.count, vpls.further,"
             " bounces or ism.size, or take visibility=ray, which needs no maps"
         )
 
