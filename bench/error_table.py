@@ -1,9 +1,9 @@
 """The table of errors that ``relight --budget`` predicts from, fitted to the rows of ``bench tradeoff``.
 
 Squared FLIP (less that of the truth's noise) of a sweep's point over that of the stage's base point (``REFERENCE`` of
-:mod:`warp_dvct.budget`) gives what a value of a knob costs; the table holds its geometric
-mean over the stages of a class. The base itself is a power law in how much the objects change the picture, found by the
-survey. How far several improvements together fall short of their product is fitted to all points.
+:mod:`warp_dvct.accuracy`) gives what a value of a knob costs; the table holds its geometric mean over the stages of a
+class. The base itself is a power law in how much the objects change the picture, found by the survey; so is what
+missing bounces cost. How far several improvements together fall short of their product is fitted to all points.
 """
 
 from __future__ import annotations
@@ -18,16 +18,20 @@ from typing import Any
 import numpy as np
 
 from warp_dvct.accuracy import (
-    CLOSED,
+    BOUNCES,
+    CONES,
     DETAIL,
     DETAILS,
+    FORMS,
     LADDERS_OF,
     REFERENCE,
     REFERENCE_OF,
     STRIDE,
     Accuracy,
     class_of,
+    form_table,
     kind_of,
+    missing_bounces,
     stride_table,
 )
 from warp_dvct.bench.error import read, stage_file
@@ -44,12 +48,11 @@ def fit_table(rows: Sequence[Mapping[str, Any]]) -> tuple[Accuracy, list[tuple[s
     """The table, and for each row its name, measured and predicted FLIP.
 
     Args:
-        rows: Of ``bench tradeoff``, of several stages; path tracing and cones, which a budget does not choose, are left
-            aside.
+        rows: Of ``bench tradeoff``, of several stages; path tracing, which has no table, is left aside.
     Raises:
         OptionError: No stage has the base point, or no knob was swept.
     """
-    rows = [r for r in rows if r["method"] in LADDERS_OF and not _by_cones(_settings(r))]
+    rows = [r for r in rows if r["method"] in LADDERS_OF]
     launcher = Launcher("cpu")
     surveys = {}
     for stage in dict.fromkeys(r["stage"] for r in rows):
@@ -62,9 +65,9 @@ def fit_table(rows: Sequence[Mapping[str, Any]]) -> tuple[Accuracy, list[tuple[s
     knobs = {kind: tables for sweep in sweeps.values() for kind, tables in sweep.tables(surveys).items() if tables}
     if not any(knobs.values()):
         raise OptionError("no knob was swept; run bench tradeoff --knob gather.rays and others first")
-    coefficients = _power_law(cones, surveys)
+    coefficients = _power_law(cones, surveys) | {"bounces": _bounces(cones, surveys)}
     vpls = sweeps["instant-radiosity"]
-    coefficients |= _constants(vpls, surveys, coefficients["change"])
+    coefficients |= _constants(vpls, surveys, coefficients)
     tables = [Accuracy({**coefficients, "overlap": float(power)}, knobs, 0.0) for power in np.arange(0.1, 1.61, 0.05)]
 
     def compare(table: Accuracy, methods: Sequence[str]) -> list[tuple[str, float, float]]:
@@ -93,10 +96,6 @@ def _settings(row: Mapping[str, Any]) -> Settings:
     counted = {NAMES[name] for name in (*REFERENCE, *row.get("settings", ()))}
     measured = row["resolved"].items()
     return Settings(**{k: v for k, v in measured if k in counted or row["quality"] != "balanced"})
-
-
-def _by_cones(settings: Settings) -> bool:
-    return settings.gather == "cones" or settings.shadows == "cone" or settings.glossy == "cones"
 
 
 @dataclass(frozen=True)
@@ -128,13 +127,30 @@ class _Sweep:
     def tables(self, surveys: Mapping[str, Survey]) -> dict[str, dict[str, list[list[float]]]]:
         """By class of scenes and knob."""
         knobs: dict[str, dict[str, list[list[float]]]] = {}
-        for knob in (ladder.knob for ladder in LADDERS_OF[self.method] if ladder.knob != DETAIL):
+        ladders = [x.knob for x in LADDERS_OF[self.method] if x.knob not in (DETAIL, BOUNCES)]
+        for knob in (*ladders, *FORMS) if CONES in ladders else ladders:
             classes = {stage: class_of(knob, surveys[stage], self.method) for stage in self.base}
             for kind in dict.fromkeys(classes.values()):
                 sweep = replace(self, stages=[s for s in self.base if classes[s] == kind])
-                tables = sweep.by_detail() if knob == STRIDE else {knob: sweep.excess(knob)}
-                knobs.setdefault(kind, {}).update({name: table for name, table in tables.items() if len(table) > 1})
+                if knob == STRIDE:
+                    tables = sweep.by_detail()
+                elif knob in FORMS:
+                    tables = sweep.by_form(knob)
+                else:
+                    tables = {knob: sweep.excess(knob)}
+                knobs.setdefault(kind, {}).update({k: t for k, t in tables.items() if len(t) > 1 or knob in FORMS})
         return knobs
+
+    def by_form(self, name: str) -> dict[str, list[list[float]]]:
+        """Of a setting that asks for cones; where these gather diffuse light, of their number."""
+        field = NAMES[name]
+        if name == "gather":
+            found = self._found(CONES, {field, NAMES[CONES]}, None, (field, FORMS[name]))
+            falling = _falling(np.array(list(found.values())))
+            table = {CONES: [[v, round(float(e), 4)] for v, e in zip(found, falling, strict=True)]}
+            return table if found else {}
+        found = self._found(name, {field}, None, (field, FORMS[name]))
+        return {form_table(name): [[1.0, round(e, 4)] for e in found.values()]} if found else {}
 
     def excess(self, knob: str) -> list[list[float]]:
         """``[value, excess]`` by rising value, falling from cheap to dear."""
@@ -167,16 +183,23 @@ class _Sweep:
             tables[stride_table(detail)] = [[v, round(float(e), 4)] for v, e in zip(full, last, strict=True)]
         return tables
 
-    def _found(self, knob: str, moved: set[str], detail: float | None) -> dict[float, float]:
-        """By rising value, the geometric mean over the stages of squared FLIP over the reference's, less one."""
+    def _found(
+        self, knob: str, moved: set[str], detail: float | None, given: tuple[str, str] | None = None
+    ) -> dict[float, float]:
+        """By rising value, the geometric mean over the stages of squared FLIP over the reference's, less one.
+
+        Args:
+            moved: Fields that may differ from the reference. detail: That points have. given: A field's value likewise.
+        """
         reference = asdict(make_settings("balanced", REFERENCE_OF[self.method]))
         found: dict[float, list[float]] = {}
         for (stage, width, settings), flip in self.points.items():
-            other_detail = detail is not None and settings.gather_detail != detail
-            if stage not in self.stages or width != self.main or other_detail:
+            other = detail is not None and settings.gather_detail != detail
+            other = other or (given is not None and getattr(settings, given[0]) != given[1])
+            if stage not in self.stages or width != self.main or other:
                 continue
             if {k for k, v in asdict(settings).items() if v != reference[k]} <= moved:
-                value = float(getattr(settings, NAMES[knob]))
+                value = 1.0 if knob in FORMS else float(getattr(settings, NAMES[knob]))
                 found.setdefault(value, []).append(2.0 * math.log(max(flip, LEAST) / self.base[stage]))
         return {value: math.expm1(float(np.mean(found[value]))) for value in sorted(found)}
 
@@ -192,27 +215,30 @@ def _falling(values: np.ndarray) -> np.ndarray:
     return np.concatenate([np.full(int(n), v) for v, n in blocks]) if blocks else values
 
 
-def _constants(sweep: _Sweep, surveys: Mapping[str, Survey], change: float) -> dict[str, float]:
-    """Of a method of which few stages were measured: by class, what is left of log FLIP beside the change's power."""
+def _constants(sweep: _Sweep, surveys: Mapping[str, Survey], coefficients: Mapping[str, float]) -> dict[str, float]:
+    """Of a method of which few stages were measured: by class, what is left of log FLIP beside the known powers."""
     found: dict[str, list[float]] = {}
     for stage, flip in sweep.base.items():
-        size = max(surveys[stage].affected * surveys[stage].change, 1e-3)
-        left = math.log(flip) - change * math.log(size)
+        left = math.log(flip) - sum(coefficients[name] * size for name, size in _sizes(surveys[stage]).items())
         found.setdefault(class_of("", surveys[stage], sweep.method), []).append(left)
     return {kind: float(np.mean(values)) for kind, values in found.items()}
 
 
+def _sizes(survey: Survey) -> dict[str, float]:
+    """Logarithms whose multiples make that of FLIP at the reference, see ``Accuracy.reference``."""
+    return {"shown": math.log(max(survey.shown, 1e-4)), "change": math.log(max(survey.change, 1e-2))}
+
+
 def _power_law(sweep: _Sweep, surveys: Mapping[str, Survey]) -> dict[str, float]:
-    """Log FLIP = constants of the classes + power * log(mean change over mean picture) + power * log(width / 320)."""
+    """Log FLIP = constants of the classes + powers of what the objects change + power * log(width / 320)."""
     base, points, main = sweep.base, sweep.points, sweep.main
     stages = list(base)
     columns = [[float(kind_of(surveys[s]) == k) for s in stages] for k in ("diffuse", "glossy")]
-    columns.append([float(surveys[s].met <= CLOSED) for s in stages])
-    columns.append([math.log(max(surveys[s].affected * surveys[s].change, 1e-3)) for s in stages])
+    columns += [[_sizes(surveys[s])[name] for s in stages] for name in ("shown", "change")]
     matrix, values = np.array(columns).T, np.log([base[s] for s in stages])
-    # A little pull towards no dependence keeps both sensible where there are few stages.
-    pull = np.diag([0.0, 0.0, 0.1, 0.3])[2:]
-    found = np.linalg.lstsq(np.vstack([matrix, pull]), np.append(values, [0.0, 0.0]), rcond=None)[0]
+    # A little pull towards errors in proportion to the change keeps the powers sensible where there are few stages.
+    pull = np.diag([0.0, 0.0, 0.3, 0.1])[2:]
+    found = np.linalg.lstsq(np.vstack([matrix, pull]), np.append(values, [0.3, 0.0]), rcond=None)[0]
     slopes = []
     for (stage, width, settings), flip in points.items():
         at_main = points.get((stage, main, settings), 0.0)
@@ -223,10 +249,28 @@ def _power_law(sweep: _Sweep, surveys: Mapping[str, Survey]) -> dict[str, float]
     return {
         "diffuse": float(found[0]) + shift,
         "glossy": (float(found[1]) if any(columns[1]) else float(found[0])) + shift,
-        "open": float(found[2]),
+        "shown": float(found[2]),
         "change": float(found[3]),
         "width": slope,
     }
+
+
+def _bounces(sweep: _Sweep, surveys: Mapping[str, Survey]) -> float:
+    """Measured FLIP of missing bounces over what the survey says of them: the geometric mean of those points in which
+    they are most of the error."""
+    reference = asdict(make_settings("balanced", REFERENCE_OF[sweep.method]))
+    ratios = []
+    for (stage, width, settings), flip in sweep.points.items():
+        alone = {k for k, v in asdict(settings).items() if v != reference[k]} == {NAMES[BOUNCES]}
+        if (
+            alone
+            and width == sweep.main
+            and settings.bounces > 0
+            and flip > math.sqrt(2.0) * sweep.base.get(stage, 1.0)
+        ):
+            expected = surveys[stage].later * missing_bounces(settings.bounces, surveys[stage].decay)
+            ratios.append(math.log(math.sqrt(flip**2 - sweep.base[stage] ** 2) / expected))
+    return math.exp(float(np.mean(ratios))) if ratios else 1.0
 
 
 def _name(method: str, settings: Settings) -> str:

@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from known_costs import made_model
+from known_costs import chosen, made_model
 
 from warp_dvct import Relighter
-from warp_dvct.accuracy import LADDERS, STRIDE, load_accuracy
-from warp_dvct.budget import Choice, choose
+from warp_dvct.accuracy import LADDERS
+from warp_dvct.budget import choose
 from warp_dvct.calibrate import calibrate, subdivide
 from warp_dvct.cost import (
     FIRST_RAYS,
@@ -28,19 +28,9 @@ from warp_dvct.errors import FileError, OptionError
 from warp_dvct.launch import Launcher
 from warp_dvct.scene import PointCloud, Role
 from warp_dvct.settings import NAMES, make_settings
-from warp_dvct.survey import Survey, survey
+from warp_dvct.survey import survey
 from warp_dvct.usd.read import read_stage
 from warp_dvct.usd_scenes import path
-
-
-@pytest.fixture(scope="module")
-def surveys(launcher) -> dict[str, Survey]:
-    """Of three stages: a closed diffuse room, one with mirrors, an open scene."""
-    found = {}
-    for name in ("room_area", "room_glossy", "ground_dome"):
-        scene = read_stage(path(name))
-        found[name] = survey(scene, make_settings(), launcher, 16 / 9, has_plate=True)
-    return found
 
 
 def test_a_survey_counts_what_is_in_the_picture(surveys):
@@ -129,7 +119,7 @@ def counted_gathers(monkeypatch) -> list[float]:
 def test_gathered_rays_are_those_of_a_frame(surveys, counted_gathers, stage, stride, detail):
     """Rays told from the survey against those that a frame of another size traces, halved strides included."""
     settings = {"gather.stride": stride, "gather.object_stride": stride // 2, "gather.detail": detail}
-    settings |= {"gather.rays": 4, "gather.object_rays": 4, "volume.resolution": 32, "volume.coarse": 32, "bounces": 1}
+    settings |= {"gather.rays": 4, "gather.object_rays": 4, "volume.resolution": 32, "volume.coarse": 32, "bounces": 4}
     relighter = Relighter(path(stage), width=256, settings=settings)
     relighter.render(np.full((relighter.height, 256, 3), 0.5, np.float32))
     expected = count_work(relighter.settings, surveys[stage], 256, relighter.height)["gather"]["rays"]
@@ -223,11 +213,6 @@ def test_threads_by_amdahl(surveys):
     assert made_model(threads=1).seconds(work, 2) == pytest.approx(0.17)
 
 
-def chosen(surveys, stage: str = "room_area", **request) -> Choice:
-    """A choice on the made machine at 320 x 180."""
-    return choose(surveys[stage], made_model(), width=320, height=180, threads=2, **request)
-
-
 @pytest.mark.parametrize("stage", ["room_area", "room_glossy", "ground_dome"])
 def test_more_time_is_used_and_predicts_less_error(surveys, stage):
     """The prediction lands within a tenth of the budget, and the error never rises with it."""
@@ -267,15 +252,6 @@ def test_what_is_given_stays_and_what_is_not_needed_is_left_out(surveys):
     json.dumps(choice.to_dict())
 
 
-def test_cones_are_said_to_be_unknown(surveys):
-    """Their number is no ladder's: rays that nobody traces do not fill a budget."""
-    choice = chosen(surveys, seconds=20.0, fixed={"gather": "cones", "shadows": "cone"})
-    assert choice.settings.gather_rays == make_settings().gather_rays
-    assert "gather=cones shadows=cone: what cones take is not in the model" in choice.describe()
-    assert "cone" not in chosen(surveys, seconds=20.0).describe()
-    assert choice.pace is None
-
-
 @pytest.mark.parametrize("budget", [0.0, -1.0, math.nan, math.inf])
 def test_what_is_no_budget(surveys, budget):
     for name in ("seconds", "max_error"):
@@ -290,28 +266,6 @@ def test_the_floor_is_said(surveys):
         chosen(surveys)
     with pytest.raises(OptionError, match="not both"):
         chosen(surveys, seconds=1.0, max_error=0.1)
-
-
-def test_the_shipped_table_orders_values(surveys):
-    """Dearer values never err more, and the presets come out in their order."""
-    table = load_accuracy()
-    assert set(table.knobs) >= {"diffuse", "glossy", "instant-radiosity closed", "instant-radiosity open"}
-    for knobs in table.knobs.values():
-        for knob, values in knobs.items():
-            errors = [e for _, e in values]
-            assert errors == sorted(errors, reverse=not knob.startswith((STRIDE, "vpls.tiles"))), knob
-    for found in surveys.values():
-        draft, balanced, high = (table.error(make_settings(q), found, 320) for q in ("draft", "balanced", "high"))
-        assert draft > balanced > high > 0
-        finer = [
-            table.excess(STRIDE, make_settings("balanced", {STRIDE: 16, "gather.detail": d}), found)
-            for d in (0.0, 0.5, 0.3, 0.25, 0.125)
-        ]
-        assert finer == sorted(finer, reverse=True)
-    rays = [make_settings("balanced", {"gather.rays": n}) for n in (512, 1024, 8192, 65536)]
-    more = [table.excess("gather.rays", settings, surveys["room_area"]) for settings in rays]
-    assert more == sorted(more, reverse=True)
-    assert more[-1] > -1
 
 
 def test_models_are_kept_by_machine(tmp_path, monkeypatch):
@@ -350,7 +304,7 @@ def test_calibrating_measures_every_pass(monkeypatch):
     seen = []
     model, samples = calibrate(frames=4, report=lambda name, share: seen.append(share))
     assert seen[-1] == 1.0
-    assert len(samples) == 2 * (4 + 4 + 1)  # surveys, frames, and one of instant radiosity
+    assert len(samples) == 2 * (4 + 4 + 2 + 1)  # surveys, frames, two by cones, and one of instant radiosity
     assert {
         "survey",
         "choosing",

@@ -7,28 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from known_costs import made_model
+from known_costs import chosen, made_model
 
 from warp_dvct import Relighter
-from warp_dvct.budget import Choice, choose
 from warp_dvct.cost import PROBE, price
 from warp_dvct.pace import BELIEVED, LATER, Pace, try_machine, with_rays
-from warp_dvct.settings import Settings, make_settings
-from warp_dvct.survey import Survey, survey
-from warp_dvct.usd.read import read_stage
+from warp_dvct.settings import Settings
 from warp_dvct.usd_scenes import path
-
-
-@pytest.fixture(scope="module")
-def surveys(launcher) -> dict[str, Survey]:
-    """Of a closed diffuse room, one with mirrors, an open scene."""
-    scenes = {name: read_stage(path(name)) for name in ("room_area", "room_glossy", "ground_dome")}
-    return {name: survey(scene, make_settings(), launcher, 16 / 9, has_plate=True) for name, scene in scenes.items()}
-
-
-def chosen(surveys, stage: str = "room_area", **request) -> Choice:
-    """A choice on the made machine at 320 x 180."""
-    return choose(surveys[stage], made_model(), width=320, height=180, threads=2, **request)
 
 
 class Machine:

@@ -17,29 +17,36 @@ import numpy as np
 
 from warp_dvct.errors import FileError
 from warp_dvct.settings import NAMES, Settings
-from warp_dvct.survey import Survey
+from warp_dvct.survey import ALL_BOUNCES, FLIP_POWER, Survey
 
 TABLE_FILE = Path(__file__).with_name("accuracy.json")
 # The point that the table of errors is relative to.
 REFERENCE = {
-    "volume.resolution": 128,
+    "volume.resolution": 64,
     "volume.coarse": 64,
     "rsm.texels": 1024,
+    "rsm.density": 2.0,
     "gather.rays": 64,
     "gather.object_rays": 64,
     "gather.stride": 8,
     "gather.object_stride": 4,
-    "gather.detail": 0.25,
+    "gather.detail": 0.15,
     "shadows.samples": 16,
     "shadows.probes": 8,
     "bounces": 8,
     "patches.count": 8192,
+    "patches.rays": 64,
     "antialias": 4,
     "glossy.rays": 8,
 }
 CLOSED = 0.8  # share of gathered rays that meet a surface: above it a scene counts as a closed room
 STRIDE, DETAIL, RAYS, VPLS = "gather.stride", "gather.detail", "gather.rays", "vpls.count"
-DETAILS = (0.0, 0.5, 0.25, 0.125)
+DENSITY, CONES, BOUNCES = "rsm.density", "cones.count", "bounces"
+FORMS = {"gather": "cones", "shadows": "cone", "glossy": "cones"}  # settings that may ask for cones
+FINE_SHARE = 0.25  # of what too few texels cost, that of the fine volume; the coarse one lights most of what is seen
+LEAST_DECAY = 0.05  # of light from bounce to bounce; less is not told from none
+DETAILS = (0.0, 0.3, 0.15, 0.075)
+FURTHER = ("patches.count", "patches.rays")  # knobs of the second and further bounces
 OBJECT_STRIDE = {16: 8, 12: 6, 8: 4, 6: 3, 4: 2, 2: 1, 1: 1}
 
 
@@ -64,17 +71,19 @@ class Ladder:
 
 
 LADDERS = (
-    Ladder("volume.resolution", (32, 64, 96, 128, 192, 256, 384, 512)),
+    Ladder("volume.resolution", (32, 48, 64, 96, 128, 192, 256, 384, 512)),
     Ladder("volume.coarse", (32, 64, 96, 128, 192, 256)),
-    Ladder("rsm.texels", (64, 128, 192, 256, 384, 512, 1024, 2048)),
+    Ladder(DENSITY, (0.5, 1, 1.5, 2, 3, 4)),
     Ladder(RAYS, (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)),
     Ladder(STRIDE, (16, 12, 8, 6, 4, 2, 1)),
     Ladder(DETAIL, DETAILS),
     Ladder("shadows.samples", (1, 2, 4, 8, 16, 32, 64)),
     Ladder("bounces", (1, 2, 4, 6, 8, 12)),
-    Ladder("patches.count", (256, 1024, 4096, 8192, 16384, 32768)),
+    Ladder("patches.count", (256, 512, 1024, 4096, 8192, 16384, 32768)),
+    Ladder("patches.rays", (16, 32, 64, 128)),
     Ladder("antialias", (0, 2, 4, 8, 16)),
     Ladder("glossy.rays", (1, 2, 4, 8, 16, 32, 64, 128)),
+    Ladder(CONES, (4, 6, 9, 16, 25, 36)),
 )
 
 
@@ -98,11 +107,13 @@ class Accuracy:
     """What was measured of errors.
 
     Attributes:
-        base: Coefficients of the logarithm of FLIP at the reference, see :meth:`reference`, and ``overlap``, the
-            power by which improvements of several knobs together fall short of their product.
+        base: Coefficients of the logarithm of FLIP at the reference, see :meth:`reference`; ``overlap``, the power by
+            which improvements of several knobs together fall short of their product; ``bounces``, FLIP of missing
+            bounces over ``Survey.later``.
         knobs: By class of scene and knob: values, and by how much squared FLIP exceeds that of ``REFERENCE``, over it.
-            Knobs of further bounces go by ``open`` and ``closed`` scenes, the others by
-            ``diffuse`` and ``glossy`` ones. Strides have a table for each of ``DETAILS`` (:func:`stride_table`).
+            Knobs of patches go by ``open`` and ``closed`` scenes, the others by ``diffuse`` and ``glossy`` ones.
+            Strides have a table for each of ``DETAILS`` (:func:`stride_table`); forms that ask for cones one of a
+            single value (:func:`form_table`), or, where diffuse light is gathered, of the number of cones.
         spread: Standard deviation of the logarithm of measured over predicted FLIP.
     """
 
@@ -111,19 +122,19 @@ class Accuracy:
     spread: float
 
     def reference(self, survey: Survey, width: int, method: str = "delta-cones") -> float:
-        """FLIP at the method's reference: by class, powers of the mean change of the picture and of its width."""
-        size = max(survey.affected * survey.change, 1e-3)
-        power = self.base["change"] * math.log(size) + self.base["width"] * math.log(width / 320.0)
-        if method != "delta-cones":
-            return math.exp(self.base[class_of("", survey, method)] + power)
-        power += 0.0 if survey.met > CLOSED else self.base["open"]  # less of the light there is indirect
-        return math.exp(self.base[kind_of(survey)] + power)
+        """FLIP at the method's reference: by class, powers of what the objects change in the picture (``Survey.shown``
+        and ``change``) and of its width."""
+        power = self.base["shown"] * math.log(max(survey.shown, 1e-4))
+        power += self.base["change"] * math.log(max(survey.change, 1e-2))
+        power += self.base["width"] * math.log(width / 320.0)
+        return math.exp(self.base[class_of("", survey, method)] + power)
 
     def error(self, settings: Settings, survey: Survey, width: int, method: str = "delta-cones") -> float:
         """Mean LDR-FLIP of the picture against many bounces."""
         if not survey.changes:
             return 0.0
         found = [self.excess(ladder.knob, settings, survey, method) for ladder in LADDERS_OF[method]]
+        found += self.forms(settings, survey, method)
         return self.reference(survey, width, method) * math.sqrt(self.combined(found))
 
     def combined(self, excesses: Iterable[float]) -> float:
@@ -137,21 +148,68 @@ class Accuracy:
 
     def excess(self, knob: str, settings: Settings, survey: Survey, method: str = "delta-cones") -> float:
         """Of squared FLIP over that at the reference, where only ``knob`` is as in ``settings``."""
-        if knob == DETAIL or not matters(knob, survey):
+        if knob == DETAIL or not (matters(knob, survey, settings) and works(knob, settings)):
             return 0.0  # the strides' tables are by detail
         tables = self.knobs.get(class_of(knob, survey, method), {})
         value = float(getattr(settings, NAMES[knob]))
-        if knob == STRIDE:
-            ranks = [detail_rank(detail) for detail in DETAILS]
-            found = [_look_up(tables.get(stride_table(detail)), value) for detail in DETAILS]
-            return float(np.interp(detail_rank(settings.gather_detail), ranks, found))
         table = tables.get(knob)
+        if knob == BOUNCES:
+            missing = self.base.get("bounces", 0.0) * survey.later * missing_bounces(settings.bounces, survey.decay)
+            return (missing / self.reference(survey, 320, method)) ** 2
+        if knob == STRIDE:
+            return _strides(tables, settings)
+        if knob == DENSITY:
+            return _densities(table, settings, survey)
         if knob == FILLED[method] and table and value > table[-1][0]:
             # Noise goes as one over the rays, down to what other causes leave: here what the last two values point to.
             (v0, e0), (v1, e1) = table[-2:]
             limit = max(e1 - (e0 - e1) / (v1 / v0 - 1.0), -1.0)
             return limit + (e1 - limit) * v1 / value
         return _look_up(table, value)
+
+    def forms(self, settings: Settings, survey: Survey, method: str = "delta-cones") -> list[float]:
+        """Excesses of shadows and reflections that are asked for by cones."""
+        if method != "delta-cones":
+            return []
+        tables = self.knobs.get(kind_of(survey), {})
+        asked = [name for name in ("shadows", "glossy") if getattr(settings, name) == FORMS[name]]
+        return [_look_up(tables.get(form_table(name)), 1.0) for name in asked]
+
+
+def _strides(tables: dict[str, list[list[float]]], settings: Settings) -> float:
+    """Of the strides with the detail that is asked for; cones halve none."""
+    ranks = [detail_rank(detail) for detail in DETAILS]
+
+    def excess(stride: float, detail: float) -> float:
+        found = [_look_up(tables.get(stride_table(d)), stride) for d in DETAILS]
+        return float(np.interp(detail_rank(detail), ranks, found))
+
+    stride = float(settings.gather_stride)
+    if settings.gather == FORMS["gather"]:
+        return excess(stride, 0.0) - excess(float(REFERENCE[STRIDE]), 0.0)  # the rest is in the cones' own table
+    return excess(stride, settings.gather_detail)
+
+
+def _densities(table: list[list[float]] | None, settings: Settings, survey: Survey) -> float:
+    """Of the texels that a voxel gets: fewer than asked for where ``rsm.texels`` limits a map."""
+    found = []
+    for need in survey.maps:
+        edges = [(FINE_SHARE, need.fine * settings.volume_resolution)]
+        if need.coarse > 0.0 and settings.volume_coarse > 0:
+            edges.append((1.0 - FINE_SHARE, need.coarse * settings.volume_coarse))
+        total = sum(share for share, _ in edges)
+        for share, voxels in edges:
+            density = min(settings.rsm_density, settings.rsm_texels / max(voxels, 1e-6))
+            found.append(share / total / len(survey.maps) * _look_up(table, density))
+    return sum(found)
+
+
+def missing_bounces(bounces: int, decay: float) -> float:
+    """FLIP of the light of further bounces than these, up to ``ALL_BOUNCES``, over that of all but the first: the rest
+    of a geometric series, in FLIP's power of it."""
+    ratio = min(max(decay, LEAST_DECAY), 0.999)
+    last = ratio ** (ALL_BOUNCES - 1)
+    return (max(ratio ** (bounces - 1) - last, 0.0) / (1.0 - last)) ** FLIP_POWER
 
 
 def _look_up(table: list[list[float]] | None, value: float) -> float:
@@ -164,6 +222,11 @@ def _look_up(table: list[list[float]] | None, value: float) -> float:
 def stride_table(detail: float) -> str:
     """Name of the strides' table for a detail."""
     return f"{STRIDE} {DETAIL}={detail:g}"
+
+
+def form_table(name: str) -> str:
+    """Name of the table of what is asked for by cones."""
+    return f"{name}={FORMS[name]}"
 
 
 def detail_rank(detail: float) -> float:
@@ -190,7 +253,7 @@ def class_of(knob: str, survey: Survey, method: str = "delta-cones") -> str:
     openness = "closed" if survey.met > CLOSED else "open"
     if method != "delta-cones":
         return f"{method} {openness}"
-    return openness if knob in ("bounces", "patches.count") else kind_of(survey)
+    return openness if knob in FURTHER else kind_of(survey)
 
 
 def kind_of(survey: Survey) -> str:
@@ -198,9 +261,19 @@ def kind_of(survey: Survey) -> str:
     return "diffuse" if survey.roughness is None else "glossy"
 
 
-def matters(knob: str, survey: Survey) -> bool:
+def matters(knob: str, survey: Survey, settings: Settings) -> bool:
+    """Whether a knob does anything in a scene, and for rays or cones as they are asked for."""
+    if knob in (RAYS, DETAIL):
+        return settings.gather == "rays"
+    if knob == CONES:
+        return settings.gather == FORMS["gather"]
     if knob == "glossy.rays":
-        return survey.roughness is not None
+        return survey.roughness is not None and settings.glossy == "rays"
     if knob == "shadows.samples":
         return survey.lights > 0
     return True
+
+
+def works(knob: str, settings: Settings) -> bool:
+    """Whether a knob that matters does anything just now: without further bounces no patch carries light."""
+    return settings.bounces > 1 or knob not in FURTHER

@@ -1,8 +1,9 @@
 """Choosing settings for a time or an error: ``warp-dvct relight --budget SECONDS`` and ``--max-error FLIP``.
 
 The time of a choice is predicted by the cost model (:mod:`warp_dvct.cost`), its error by a table of what each knob was
-measured to cost (:mod:`warp_dvct.accuracy`). Starting from the cheapest choice, the step that takes off the most
-squared error for its time is taken, again and again, until the time is used up or the error is reached.
+measured to cost (:mod:`warp_dvct.accuracy`). Starting from the cheapest choice, and from the dearest preset that fits,
+the step that takes off the most squared error for its time is taken, again and again, until the time is used up or the
+error is reached.
 """
 
 from __future__ import annotations
@@ -12,20 +13,39 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from warp_dvct.accuracy import DETAIL, FILLED, LADDERS_OF, RAYS, Accuracy, Ladder, load_accuracy, matters
+from warp_dvct.accuracy import (
+    BOUNCES,
+    DENSITY,
+    DETAIL,
+    FILLED,
+    FURTHER,
+    LADDERS_OF,
+    RAYS,
+    STRIDE,
+    Accuracy,
+    Ladder,
+    detail_rank,
+    load_accuracy,
+    matters,
+)
 from warp_dvct.cost import CHOOSING, CostModel, Counts, count_survey, count_work, price
 from warp_dvct.cost_vpls import count_vpl_work
 from warp_dvct.errors import OptionError
 from warp_dvct.pace import RAYS_SET, Pace
 from warp_dvct.passes.gather import FINEST
-from warp_dvct.settings import NAMES, Settings, make_settings
+from warp_dvct.settings import NAMES, QUALITIES, Settings, make_settings
 from warp_dvct.survey import Survey
 
 AIM = 0.95  # of the budget, for the settings' prediction; what is left when rays are settled goes into them
 VOXELS_PER_FEATURE = 2.0  # across the smallest extent of an object, for its light not to pass through it
 NEARLY = 0.9  # of what is aimed at: a choice that takes less has nothing more to gain
 SHOWS = 0.005  # of an error: what doubling the rays has to take off it to be worth their time
-CONES = ("gather", "shadows", "glossy")  # settings that may ask for cones
+# What the errors of a knob's values depend on besides.
+BESIDES = {
+    STRIDE: (DETAIL,),
+    DENSITY: ("volume.resolution", "volume.coarse", "rsm.texels"),
+    **dict.fromkeys(FURTHER, (BOUNCES,)),
+}
 MOST = {"gather.rays": 65536, "vpls.count": 4096}
 
 
@@ -149,15 +169,14 @@ class _Chooser:
         self.ladders = [
             self._required(x)
             for x in LADDERS_OF[method]
-            if matters(x.knob, survey)
-            and not any(k in fixed for k in x.settings(x.values[0]))
-            and not (self.base.gather == "cones" and x.knob in (RAYS, DETAIL))
+            if matters(x.knob, survey, self.base) and not any(k in fixed for k in x.settings(x.values[0]))
         ]
         self.planning = {"survey": count_survey(survey), CHOOSING: {"frame": 1.0}}
         units = model.clock_units(threads)
         self.prices = {name: {unit: slowness * cost for unit, cost in costs.items()} for name, costs in units.items()}
         self.reference = accuracy.reference(survey, width, method) if survey.changes else 0.0
-        self.excesses: dict[tuple[str, float, float], float] = {}
+        self.forms = accuracy.forms(self.base, survey, method)
+        self.excesses: dict[tuple[Any, ...], float] = {}
 
     def _required(self, ladder: Ladder) -> Ladder:
         """Without voxels that are too large for the objects: no error that the table knows shows that."""
@@ -187,11 +206,11 @@ class _Chooser:
         if not self.survey.changes:
             return 0.0
         found = (self.excess(ladder.knob, settings) for ladder in LADDERS_OF[self.method])
-        return self.reference**2 * self.accuracy.combined(found)
+        return self.reference**2 * self.accuracy.combined((*found, *self.forms))
 
     def excess(self, knob: str, settings: Settings) -> float:
         """As ``Accuracy.excess``, looked up once."""
-        key = knob, getattr(settings, NAMES[knob]), settings.gather_detail
+        key = knob, *(getattr(settings, NAMES[name]) for name in (knob, *BESIDES.get(knob, ())))
         if key not in self.excesses:
             self.excesses[key] = self.accuracy.excess(knob, settings, self.survey, self.method)
         return self.excesses[key]
@@ -206,7 +225,8 @@ class _Chooser:
                 f" {self.height} takes about {floor:.2f} s on {self.threads} thread(s); raise it or lower --imageWidth"
             )
         aim = math.inf if budget is None else max(AIM * budget, slow_floor)
-        state, last, stopped = self._climb(state, aim, max_error)
+        ends = [self._climb(start, aim, max_error) for start in (state, *self._presets(aim))]
+        state, _, stopped = min(ends, key=lambda end: self.square(self.settings(end[0])))
         if max_error is not None and math.sqrt(self.square(self.settings(state))) > max_error:
             least = math.sqrt(self.square(self.settings(state)))
             raise OptionError(
@@ -215,13 +235,36 @@ class _Chooser:
             )
         enough = False
         if max_error is not None:
-            state = self._cheapest([state, last], max_error)
+            state = self._cheapest([state for end in ends for state in end[:2]], max_error)
         pace = None
         if budget is not None:
-            state, enough = self._fill(state, aim)
+            filled = [self._fill(end[0], aim) for end in ends]
+            state, enough = min(filled, key=lambda end: self.square(self.settings(end[0])))
             stopped = "more would not show" if enough else "the time is used up"
             pace = self._pace(state, budget, enough=enough)
         return replace(self._choice(state, floor, stopped, enough=enough), pace=pace)
+
+    def _presets(self, aim: float) -> list[dict[str, float]]:
+        """The dearest preset that fits, for the search to end no worse: steps are never taken back, and what was worth
+        its time early on may not be in the end. Values that no ladder has are rounded to the cheaper side."""
+        fit = []
+        for quality in QUALITIES:
+            wanted = make_settings(quality, self.fixed)
+            state = {}
+            for ladder in self.ladders:
+                value = float(getattr(wanted, NAMES[ladder.knob]))
+                ranks = [ladder.values.index(v) for v in ladder.values if self._no_dearer(ladder, v, value)]
+                state[ladder.knob] = ladder.values[max(ranks, default=0)]
+            if self.seconds(self.settings(state)) <= aim:
+                fit.append(state)
+        return fit[-1:]
+
+    @staticmethod
+    def _no_dearer(ladder: Ladder, value: float, than: float) -> bool:
+        falling = ladder.values[0] > ladder.values[-1]
+        if ladder.knob == DETAIL:
+            return detail_rank(value) <= detail_rank(than) + 1e-9
+        return value >= than if falling else value <= than
 
     def _pace(self, state: Mapping[str, float], aim: float, *, enough: bool) -> Pace | None:
         """What keeps a frame to its time by rays, where rays are chosen."""
@@ -341,7 +384,8 @@ class _Chooser:
                 + (f"takes {saved:.2f} s, without it squared error {share:+.0%}" if saved > 1e-4 else "the least")
             )
         lines += [f"{name}={value}: given" for name, value in sorted(self.fixed.items())]
-        left = [knob for knob in (x.knob for x in LADDERS_OF[self.method]) if not matters(knob, survey)]
+        rays = replace(self.base, gather="rays", glossy="rays")
+        left = [ladder.knob for ladder in LADDERS_OF[self.method] if not matters(ladder.knob, survey, rays)]
         lines += [f"left out: {knob}, {_WHY[knob]}" for knob in left if knob in _WHY]
         if survey.roughness is not None:
             lines.append(
@@ -352,9 +396,6 @@ class _Chooser:
                 f"the smallest object extends {survey.feature * settings.volume_resolution:.1f} voxels where"
                 f" {VOXELS_PER_FEATURE:g} are needed: light leaks through it; --set volume.resolution={self.required}"
             )
-        cones = [f"{name}={getattr(settings, name)}" for name in CONES if getattr(settings, name).startswith("cone")]
-        if cones and self.method == "delta-cones":
-            lines.append(f"{' '.join(cones)}: what cones take is not in the model, they count as rays")
         if self.slowness > 1.0:
             lines.append(f"the machine takes {self.slowness:.1f} times as long just now as when it was calibrated")
         if self.model.shipped:

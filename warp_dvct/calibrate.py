@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -38,6 +38,14 @@ STAGES = ("room_area", "room_glossy", "ground_dome", "thin_wall", "bunny")
 WIDTHS = (128, 256, 384, 512)
 COUNT = {"delta-cones": count_work, "instant-radiosity": count_vpl_work}
 FRAMES_EACH = {"delta-cones": 1, "instant-radiosity": 4}  # one of so many frames is of the method
+CONES_EACH = 2  # and one of so many is once more of delta-cones, by cones
+CONES = {
+    "gather": ("cones", "rays"),
+    "shadows": ("cone", "ray"),
+    "glossy": ("cones", "rays"),
+    "cones.count": (4, 9, 16, 36),
+    "cones.step": (0.5, 1.0, 2.0),
+}
 REPEATS = 2  # of which the least counts: other work on the machine only adds
 LONG = 2.0  # processor seconds of a frame from which one try is enough: short disturbances even out
 SPLITS = 2  # of the last stage's triangles, once more: what deep trees and many triangles cost
@@ -78,6 +86,8 @@ def calibrate(
             samples.append(looked)
             methods = [method for method, each in FRAMES_EACH.items() if k % each == 0]
             samples += [_measure(name, scene, found, launcher, rng, method) for method in methods]
+            if k % CONES_EACH == 0:
+                samples.append(_measure(name, scene, found, launcher, rng, "delta-cones", cones=True))
     report("fit", 1.0)
     return fit(samples, device=device, threads=launcher.threads, machine=processor()), samples
 
@@ -122,10 +132,17 @@ class _Clock:
 
 
 def _measure(
-    name: str, scene: Scene, found: Survey, launcher: Launcher, rng: np.random.Generator, method: str
+    name: str,
+    scene: Scene,
+    found: Survey,
+    launcher: Launcher,
+    rng: np.random.Generator,
+    method: str,
+    *,
+    cones: bool = False,
 ) -> Sample:
-    """A frame of some size under some settings."""
-    settings, width = _draw(scene, found, rng, method)
+    """A frame of some size under some settings; with ``cones``, some of them ask for cones."""
+    settings, width = _draw(scene, found, rng, method, CONES if cones else {})
     height = max(1, round(width / scene.camera.aspect))
     plate = np.full((height, width, 3), 0.5, np.float32) if found.plate else None
     size = {"width": width, "height": height, "device": launcher.device.alias, "threads": launcher.threads}
@@ -142,15 +159,18 @@ def _measure(
     return Sample(work, cpu_passes, wall_passes, f"{name} {width} {'' if found.plate else 'no plate '}{shown}")
 
 
-def _draw(scene: Scene, found: Survey, rng: np.random.Generator, method: str) -> tuple[dict[str, float], int]:
-    """Any value of each ladder and any size, but no frame of many seconds."""
+def _draw(
+    scene: Scene, found: Survey, rng: np.random.Generator, method: str, more: Mapping[str, tuple[Any, ...]]
+) -> tuple[dict[str, Any], int]:
+    """Any value of each ladder, and of what there is ``more``, and any size, but no frame of many seconds."""
     shipped = shipped_model()
-    settings: dict[str, float] = {}
+    settings: dict[str, Any] = {}
     width = WIDTHS[0]
     for _ in range(MOST_DRAWS):
         for ladder in LADDERS_OF[method]:
             values = ladder.values + (MORE_RAYS if ladder.knob == RAYS else ())
             settings |= ladder.settings(values[rng.integers(len(values))])
+        settings |= {name: values[rng.integers(len(values))] for name, values in more.items()}
         width = int(rng.choice(WIDTHS))
         work = COUNT[method](make_settings("balanced", settings), found, width, round(width / scene.camera.aspect))
         if shipped.cpu_seconds(work) <= MOST_SECONDS:

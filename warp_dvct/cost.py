@@ -13,12 +13,13 @@ import math
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
+from warp_dvct.cost_cones import by_cones, gathered_by_cones, glossy_cones, shadow_cones
 from warp_dvct.errors import FileError, OptionError
 from warp_dvct.gather_need import GatherNeed
 from warp_dvct.image import write_text
@@ -51,15 +52,23 @@ def count_work(settings: Settings, survey: Survey, width: int, height: int) -> d
     lit = survey.changes or before
     indirect = lit and settings.bounces > 0
     glossy = lit and survey.roughness is not None
+    gathered = indirect or (lit and survey.dome)
+    diffuse_cones, shadow_cone, glossy_cone = by_cones(settings)
+    cones = (gathered and diffuse_cones) or (lit and shadow_cone) or (glossy and glossy_cone)
     passes = frame_work(survey, pixels, edges)
-    if indirect or glossy:
+    if indirect or glossy or cones:
         volumes = _volumes(settings, survey, indirect)
         passes |= volumes
-        passes[REST] |= {"records": volumes["voxelize"]["records"]}  # to free them
+        records = volumes["voxelize"]["records"]
+        passes[REST] |= {"records": records}  # to free them
+        if cones:
+            passes["voxelize"] |= {"records above": records / 3.0}  # a quarter as many at each level
+            passes["pyramid"] = {"frame": 1, "records above": records / 3.0}
     if lit:
-        passes["direct"] = direct_work(settings, survey, pixels, edges)
-    if indirect or (lit and survey.dome):
-        passes["gather"] = _gather(settings, survey, width, height, edges)
+        passes["direct"] = (_direct_by_cones if shadow_cone else direct_work)(settings, survey, pixels, edges)
+    if gathered:
+        gather = _gather_by_cones if diffuse_cones else _gather
+        passes["gather"] = gather(settings, survey, width, height, edges)
     if glossy:
         passes["specular"] = _specular(settings, survey, pixels, edges)
     return passes
@@ -164,6 +173,14 @@ def direct_work(settings: Settings, survey: Survey, pixels: float, edges: float)
     }
 
 
+def _direct_by_cones(settings: Settings, survey: Survey, pixels: float, edges: float) -> Counts:
+    """Samples say how much light there is, one cone a light how much of it is left."""
+    drawn = draws(settings.shadows_samples, settings, pixels, edges) * survey.lights
+    real = survey.real * pixels + (1.0 - survey.edge.object) * edges
+    cones = shadow_cones(settings, survey, real, survey.object * pixels + survey.edge.object * edges)
+    return {"frame": 1, "points": pixels + edges, "drawn": drawn, **cones}
+
+
 def draws(each: int, settings: Settings, pixels: float, edges: float) -> float:
     """Samples of all points: an edge pixel's centre draws all, and its edge points share them out."""
     shared = math.ceil(each / settings.antialias) if settings.antialias else 0
@@ -172,6 +189,9 @@ def draws(each: int, settings: Settings, pixels: float, edges: float) -> float:
 
 def _specular(settings: Settings, survey: Survey, pixels: float, edges: float) -> Counts:
     """Rays of sharp lobes end in a surface that is lit by every light; those of blurred ones in voxels."""
+    points = (survey.sharp + survey.blurred) * pixels + (survey.edge.sharp + survey.edge.blurred) * edges
+    if settings.glossy == "cones":
+        return {"frame": 1, "points": points, **glossy_cones(settings, survey, points)}
     sharp = draws(settings.glossy_rays, settings, survey.sharp * pixels, survey.edge.sharp * edges)
     blurred = draws(settings.glossy_rays, settings, survey.blurred * pixels, survey.edge.blurred * edges)
     return {
@@ -180,8 +200,18 @@ def _specular(settings: Settings, survey: Survey, pixels: float, edges: float) -
         "sharp deep": sharp * tree_depth(survey) * (1 + len(survey.maps)),
         "blurred": blurred,
         "blurred deep": blurred * tree_depth(survey),
-        "points": (survey.sharp + survey.blurred) * pixels + (survey.edge.sharp + survey.edge.blurred) * edges,
+        "points": points,
     }
+
+
+def _gather_by_cones(settings: Settings, survey: Survey, width: int, height: int, edges: float) -> Counts:
+    """Cones of all gathered points; no detail is halved."""
+    plain = replace(settings, gather_detail=0.0)
+    first, again, objects = (1e-6 * n for n in gathered_points(plain, survey, width, height))
+    pixels = width * height * 1e-6
+    hidden = 0.0 if survey.plate else survey.object * pixels + survey.edge.object * edges
+    counts = gathered_by_cones(settings, survey, first + again + hidden, objects)
+    return {"frame": 1, "points by cones": pixels + edges, **counts}
 
 
 def _gather(settings: Settings, survey: Survey, width: int, height: int, edges: float) -> Counts:

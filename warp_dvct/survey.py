@@ -7,6 +7,7 @@ picture, so they hold for any size; nothing in it is timed, so the same scene gi
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,15 +17,18 @@ import warp as wp
 from warp_dvct import gather_need
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.gather_need import GatherNeed, Seen, View
+from warp_dvct.kept import Kept
 from warp_dvct.kernels import survey as kernels
 from warp_dvct.kernels.specular import BLURRED
 from warp_dvct.launch import Launcher
 from warp_dvct.layers import Layers
 from warp_dvct.methods import delta_cone_tracing
-from warp_dvct.metrics import affected_mask, smooth_delta
+from warp_dvct.metrics import affected_mask, smooth_delta, to_display
 from warp_dvct.passes.composite import composite
 from warp_dvct.passes.gather import glossy_hits
 from warp_dvct.passes.gbuffer import GBuffer, render_gbuffer
+from warp_dvct.passes.voxels import Voxels
+from warp_dvct.passes.vpls import LUMINANCE
 from warp_dvct.plan import Plan, make_plan
 from warp_dvct.scene import Light, LightKind, Role, Scene
 from warp_dvct.settings import Settings, make_settings
@@ -32,8 +36,10 @@ from warp_dvct.settings import Settings, make_settings
 WIDTH = 80
 RAYS = 8  # of a point, to see what is around it
 FRAGMENTS_PER_RECORD = 1.15  # of triangles larger than voxels
+ALL_BOUNCES = 8  # as the truths that errors are measured against
+FLIP_POWER = 0.7  # of a pixel's difference in colour that LDR-FLIP takes (Andersson et al. 2020, "FLIP", section 4.1)
 COARSE = {
-    "bounces": 2,
+    "bounces": ALL_BOUNCES,
     "antialias": 0,
     "volume.resolution": 32,
     "volume.coarse": 32,
@@ -55,11 +61,15 @@ REFERENCE = {"volume.resolution": 256, "volume.coarse": 128, "rsm.texels": 8192,
 
 @dataclass(frozen=True)
 class MapNeed:
-    """Texels an edge of a light's maps at which none is larger than a voxel, per voxel along the volume's edge."""
+    """Texels an edge of a light's maps at which none is larger than a voxel, per voxel along the volume's edge.
+
+    ``aperture``: Full angle [rad] that the light subtends at the fine volume's middle; None for a dome.
+    """
 
     fine: float
     coarse: float
     pair: bool
+    aperture: float | None
 
 
 @dataclass(frozen=True)
@@ -127,9 +137,12 @@ class Survey:
         near: Over all lights, shares of pixels whose line to the light passes the synthetic objects.
         affected: Share of the pixels that the objects cover or change by more than 0.01.
         change: Mean over affected pixels of the change's size, over the mean picture.
+        shown: Mean over the picture of the ``FLIP_POWER`` of the change in display luma that the objects make.
+        later: The same of the light of further bounces than the first. decay: Light of a bounce over that of the one
+            before.
         changes: Whether anything is synthetic or a light is added. plate: Whether a plate will be given.
         feature: Smallest extent of a synthetic mesh, in edges of the fine volume; 0 where there is none.
-        voxel: Edge of the fine volume in metres.
+        voxel: Edge of the fine volume in metres. reach: Edge of the coarse one, in edges of the fine one; 1 for none.
         roughness: Of the smoothest glossy material, None where the specular pass has nothing to do.
         focuses: Whether what gathered rays meet may send light to places rather than all around.
     """
@@ -152,10 +165,14 @@ class Survey:
     near: float
     affected: float
     change: float
+    shown: float
+    later: float
+    decay: float
     changes: bool
     plate: bool
     feature: float
     voxel: float
+    reach: float
     roughness: float | None
     focuses: bool
 
@@ -191,7 +208,10 @@ def survey(scene: Scene, settings: Settings, launcher: Launcher, aspect: float, 
     needs = make_plan(scene, make_settings("balanced", {**REFERENCE, **fixed}), "delta-cones", WIDTH, height)
     plan = make_plan(scene, make_settings("balanced", {**COARSE, **fixed}), "delta-cones", WIDTH, height)
     device_scene = DeviceScene.upload(launcher, scene, np.asarray(plan.origin), plan.scale)
-    pilot = _pilot(scene, device_scene, launcher, plan)
+    direct = make_plan(
+        scene, make_settings("balanced", {**COARSE, **fixed, "bounces": 1}), "delta-cones", WIDTH, height
+    )
+    pilot = _pilot(scene, device_scene, launcher, plan, direct)
     least = settings.gather_change if has_plate else 0.0
     seen = _look(scene, device_scene, launcher, plan, 2 * height, pilot.changed(least))
     return Survey(
@@ -200,7 +220,12 @@ def survey(scene: Scene, settings: Settings, launcher: Launcher, aspect: float, 
         lights=sum(x.kind != LightKind.DOME for x in scene.lights),
         dome=any(x.kind == LightKind.DOME for x in scene.lights),
         maps=tuple(
-            MapNeed(m.size / needs.fine.n, m.coarse_size / needs.coarse.n if needs.coarse else 0.0, m.pair)
+            MapNeed(
+                m.size / needs.fine.n,
+                m.coarse_size / needs.coarse.n if needs.coarse else 0.0,
+                m.pair,
+                _aperture(scene.lights[m.light], plan),
+            )
             for m in needs.maps
         ),
         fine=pilot.fine,
@@ -209,10 +234,14 @@ def survey(scene: Scene, settings: Settings, launcher: Launcher, aspect: float, 
         **seen,
         affected=pilot.affected,
         change=pilot.change,
+        shown=pilot.shown,
+        later=pilot.later,
+        decay=pilot.decay,
         changes=plan.changes,
         plate=has_plate,
         feature=_feature(scene) * plan.scale,
         voxel=1.0 / plan.scale,
+        reach=plan.coarse.edge if plan.coarse else 1.0,
         roughness=_smoothest(scene) if plan.glossy else None,
         focuses=pilot.focuses,
     )
@@ -228,6 +257,9 @@ class _Pilot:
     layers: Layers | None
     affected: float
     change: float
+    shown: float
+    later: float
+    decay: float
     shape: tuple[int, int]
     focuses: bool
 
@@ -240,9 +272,14 @@ class _Pilot:
         return size | (self.layers.mask_synthetic > 0.0)
 
 
-def _pilot(scene: Scene, device_scene: DeviceScene, launcher: Launcher, plan: Plan) -> _Pilot:
-    """Volumes of few voxels, and a picture that says how much the objects change."""
-    lit = delta_cone_tracing.light_volumes(launcher, scene, device_scene, plan)
+def _pilot(scene: Scene, device_scene: DeviceScene, launcher: Launcher, plan: Plan, once: Plan) -> _Pilot:
+    """Volumes of few voxels, and pictures that say how much the objects change and how much comes after one bounce.
+
+    Args:
+        once: ``plan`` with a single bounce.
+    """
+    kept = Kept()
+    lit = delta_cone_tracing.light_volumes(launcher, scene, device_scene, plan, kept)
     needs = [VolumeNeed(v.box.n, v.level_records[0], v.fragments.count) for v in lit.volumes]
     fine = needs[0] if needs else VolumeNeed(plan.fine.n, 0, 0)
     patches = 0.0
@@ -250,17 +287,48 @@ def _pilot(scene: Scene, device_scene: DeviceScene, launcher: Launcher, plan: Pl
         records = lit.volumes[-1].level_records[lit.bounces.level]
         patches = lit.bounces.irradiance.shape[0] // 2 / max(records, 1)  # before and after
     focusing = glossy_hits(launcher, scene, device_scene, lit.bounces, 0) is not None
-    layers, affected, change = None, 0.0, 0.0
+    layers, affected, change, shown, later, decay = None, 0.0, 0.0, 0.0, 0.0, 0.0
     if plan.changes:
-        radiance = delta_cone_tracing.render(launcher, scene, device_scene, lit, plan, with_before=True)
+        radiance = delta_cone_tracing.render(launcher, scene, device_scene, lit, plan, with_before=True, kept=kept)
         layers = composite(launcher, radiance, None)
         mask = affected_mask(smooth_delta(layers.delta, layers.mask_synthetic), layers.mask_synthetic)
         level = float(np.abs(layers.comp).mean())
         if mask.any() and level > 0.0:
             affected = float(mask.mean())
             change = float(np.abs(layers.comp - layers.plate)[mask].mean()) / level
+        first = delta_cone_tracing.light_volumes(launcher, scene, device_scene, once, kept)
+        radiance = delta_cone_tracing.render(launcher, scene, device_scene, first, once, with_before=False, kept=kept)
+        shown = _difference(layers.comp, layers.plate)
+        later = _difference(layers.comp, composite(launcher, radiance, layers.plate).comp)
+        decay = _decay(_light(lit.volumes), _light(first.volumes))
     coarse = needs[1] if len(needs) > 1 else None
-    return _Pilot(fine, coarse, patches, layers, affected, change, (plan.height, plan.width), focusing)
+    shape = plan.height, plan.width
+    return _Pilot(fine, coarse, patches, layers, affected, change, shown, later, decay, shape, focusing)
+
+
+def _difference(picture: np.ndarray, other: np.ndarray) -> float:
+    """About what LDR-FLIP says, over a constant: the mean of its power of the change in display luma."""
+    return float(((np.abs(to_display(picture) - to_display(other)) @ LUMINANCE) ** FLIP_POWER).mean())
+
+
+def _light(volumes: Sequence[Voxels]) -> float:
+    """Flux that leaves the surfaces after, in arbitrary units."""
+    total = 0.0
+    for voxels in volumes:
+        count = voxels.level_records[0]
+        field = voxels.volume.field.numpy()[: 12 * count].reshape(count, 6, 2, 4)
+        total += float(field[:, :, 1, :3].sum(dtype=np.float64)) * voxels.box.voxel**2
+    return total
+
+
+def _decay(every: float, first: float) -> float:
+    """The ratio of the geometric series of ``ALL_BOUNCES`` terms whose sum over its first term is ``every / first``."""
+    low, high = 0.0, 1.0
+    for _ in range(20):
+        ratio = 0.5 * (low + high)
+        less = sum(ratio**k for k in range(ALL_BOUNCES)) * first < every
+        low, high = (ratio, high) if less else (low, ratio)
+    return low
 
 
 def _look(
@@ -353,6 +421,20 @@ def _passing(points: np.ndarray, light: Light, plan: Plan, center: np.ndarray, r
     along = np.clip(((center - points) * direction).sum(1), 0.0, reach)
     apart = np.linalg.norm(center - points - direction * along[:, None], axis=1)
     return float((apart <= radius + wider).sum())
+
+
+def _aperture(light: Light, plan: Plan) -> float | None:
+    """Full angle [rad] of a light as the fine volume's middle sees it; None for a dome."""
+    if light.kind == LightKind.DOME:
+        return None
+    if light.kind == LightKind.DISTANT:
+        return light.angle
+    shape = math.pi if light.kind == LightKind.DISK else 4.0
+    area = shape * float(np.linalg.norm(np.cross(light.axis_x, light.axis_y)))
+    radius = plan.scale * max(light.radius, math.sqrt(area / math.pi))
+    middle = np.asarray(plan.fine.low) + 0.5 * plan.fine.edge
+    distance = float(np.linalg.norm((np.asarray(light.position) - np.asarray(plan.origin)) * plan.scale - middle))
+    return 2.0 * math.atan2(radius, distance)
 
 
 def _feature(scene: Scene) -> float:

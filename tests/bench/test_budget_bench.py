@@ -13,9 +13,12 @@ from warp_dvct.accuracy import REFERENCE
 from warp_dvct.bench import budget as module
 from warp_dvct.bench import error_table
 from warp_dvct.bench.__main__ import bench
+from warp_dvct.bench.error import read, stage_file
 from warp_dvct.bench.rows import append_row, read_rows
 from warp_dvct.errors import OptionError
+from warp_dvct.launch import Launcher
 from warp_dvct.settings import make_settings
+from warp_dvct.survey import survey
 
 
 def row(seconds: float, flip: float | None = 0.03) -> dict:
@@ -119,7 +122,7 @@ def sweep_row(stage: str, flip: float, noise: float = 0.0, **settings) -> dict:
     """A point of a sweep with a known error."""
     pairs = {k.replace("__", "."): v for k, v in settings.items()}
     row = {"kind": "tradeoff", "stage": stage, "method": "delta-cones", "quality": "balanced", "width": 320}
-    row |= {"resolved": asdict(make_settings("balanced", {**REFERENCE, **pairs}))}
+    row |= {"resolved": asdict(make_settings("balanced", {**REFERENCE, **pairs})), "settings": pairs}
     row |= {"truth": {"noise": noise, "bounces": 8}}
     return {**row, "errors": {"FLIP": {"picture": math.hypot(flip, noise)}}}
 
@@ -139,6 +142,28 @@ def test_a_table_holds_what_the_rows_say():
     for name, measured, predicted in pairs:
         assert predicted == pytest.approx(measured, rel=0.35), name
     assert table.spread < 0.3
+
+
+def test_a_table_knows_cones_and_missing_bounces():
+    """By cones: their number and what asks for them; bounces are fitted to what the survey says of them."""
+    rows = []
+    for stage, base in (("room_area", 0.02), ("colour_bleeding", 0.06)):
+        rows.append(sweep_row(stage, base))
+        rows += [sweep_row(stage, base * f, gather="cones", cones__count=n) for n, f in ((4, 3.0), (9, 2.0))]
+        rows.append(sweep_row(stage, base * 1.5, shadows="cone"))
+        rows.append(sweep_row(stage, base * 4.0, bounces=1))
+    table, pairs = error_table.fit_table(rows)
+    assert table.knobs["diffuse"]["cones.count"] == [[4.0, 8.0], [9.0, 3.0]]
+    assert table.knobs["diffuse"]["shadows=cone"] == [[1.0, 1.25]]
+    assert table.base["bounces"] > 0
+    cones = make_settings("balanced", {**REFERENCE, "gather": "cones", "cones.count": 9, "shadows": "cone"})
+    plain = make_settings("balanced", REFERENCE)
+    scene = read(stage_file("room_area"))
+    found = survey(scene, make_settings(), Launcher("cpu"), scene.camera.aspect, has_plate=True)
+    ratio = table.error(cones, found, 320) / table.error(plain, found, 320)
+    assert ratio == pytest.approx(math.sqrt(1.0 + 3.0 + 1.25), abs=1e-3)
+    for name, measured, predicted in pairs:
+        assert predicted == pytest.approx(measured, rel=0.6), name
 
 
 def test_a_table_needs_a_base_and_a_knob():
