@@ -129,8 +129,8 @@ class Settings:
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "bounces": 4,
-        "volume.resolution": 48,
-        "rsm.texels": 320,
+        "volume.resolution": 32,
+        "rsm.texels": 240,
         "antialias": 2,
         "shadows.samples": 4,
         "shadows.probes": 4,
