@@ -40,7 +40,7 @@ class BounceField:
     has_walls: wp.int32
     patches: wp.array(dtype=Patch)
     table: wp.array(dtype=wp.int32)  # first patch behind each face of a record of the level, or -1
-    mixed: wp.array(dtype=wp.int32)  # whether a record of the level, or one next to it, holds something synthetic
+    mixed: wp.array(dtype=wp.int32)  # whether a record of the level, or one next to it, has its sheets told apart
     beside: wp.array(dtype=wp.int32)  # of patches in mixed records: the patch in each voxel around that they see, or -1
     walls: wp.array(dtype=wp.vec4)  # plane of the thin wall in a record of the level: normal and offset; or 0
     irradiance: wp.array(dtype=wp.vec3)  # [patches * 2], before and after
@@ -130,7 +130,7 @@ def own_patch(field: BounceField, head: int, position: wp.vec3, synthetic: int) 
 
 @wp.struct
 class Home:
-    """The voxel of a surface point where objects are near: light comes from patches that its own ones there see."""
+    """The voxel of a surface point near objects or thin walls: light comes from patches that its own ones there see."""
 
     mixed: wp.int32
     cell: wp.vec3i

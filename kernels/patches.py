@@ -1,8 +1,8 @@
-"""Patches: the largest pieces of surface behind the faces of a coarse level's voxels, and thin walls between them."""
+"""Patches: the largest pieces of surface behind the faces of a coarse level's voxels."""
 
 import warp as wp
 
-from warp_dvct.kernels.bounce_field import NEIGHBOURS, BounceField, Patch, neighbour_step, off_surface, wall_beside
+from warp_dvct.kernels.bounce_field import NEIGHBOURS, Patch, neighbour_step
 from warp_dvct.kernels.geometry import (
     FAR,
     OFFSET_RELATIVE,
@@ -19,10 +19,6 @@ from warp_dvct.kernels.volume import Volume, brick_extent, face_weight, find_rec
 
 wp.set_module_options({"enable_backward": False})
 
-WALL_AREA = wp.constant(0.25)  # share of its voxel's face that a side of a thin wall covers
-CLEARLY = wp.constant(1.05)  # how much larger a wall has to be than another of the same voxel: equal ones stay in order
-THIN = wp.constant(0.25)  # thickest wall, in voxels of the patches' level
-OPPOSITE = wp.constant(-0.9)  # cosine between the normals of a wall's two sides
 MOST_SHEETS = wp.constant(4)  # patches behind one face
 LIFT = wp.constant(0.25)  # voxels of the patches' level that a patch looks around from above its surface
 ANY = wp.constant(-1)  # role
@@ -190,19 +186,17 @@ def _mark_synthetic(
     entries: int,
     runs: int,
     pieces: Fragments,
-    synthetic_out: wp.array(dtype=wp.int32),
+    apart_out: wp.array(dtype=wp.int32),
 ):
-    """Whether what shows on an occupied face, or shares a record with it, is synthetic."""
+    """Mark the occupied faces on which something synthetic shows, or shares a record with what does."""
     i = first + wp.tid()
     end = entries
     if i + 1 < runs:
         end = start_in[i + 1]
-    found = int(0)
     for j in range(start_in[i], end):
         # Real fragments come first.
         if pieces.triangle[pieces.order[fragments_end(pieces, face_order_in[j] / 6) - 1]] >= geo.synthetic_first:
-            found = 1
-    synthetic_out[i] = found
+            apart_out[i] = 1
 
 
 @wp.func
@@ -270,13 +264,13 @@ def _find_sheets(
     pieces: Fragments,
     near: float,
     lift: float,
-    synthetic_in: wp.array(dtype=wp.int32),
+    apart_in: wp.array(dtype=wp.int32),
     sheets_out: Sheets,
     count_out: wp.array(dtype=wp.int32),
     holds_out: wp.array(dtype=wp.int32),
 ):
-    """The largest fragment behind each occupied face that is not buried, and, in voxels that hold something synthetic,
-    one of each further sheet. ``holds_out`` is 1 for these voxels."""
+    """The largest fragment behind each occupied face that is not buried, and, in voxels of which a face is marked in
+    ``apart_in``, one of each further sheet. ``holds_out`` is 1 for these voxels."""
     i = first + wp.tid()
     end = entries
     if i + 1 < runs:
@@ -302,7 +296,7 @@ def _find_sheets(
         k = i + d
         if k >= 0 and k < runs:
             if face_key_in[k] / 6 == voxel:
-                holds = wp.max(holds, synthetic_in[k])
+                holds = wp.max(holds, apart_in[k])
                 if d < 0:
                     before += 1
     count = int(1)
@@ -374,7 +368,7 @@ def _mark_mixed(
     holds_in: wp.array(dtype=wp.int32),
     mixed_out: wp.array(dtype=wp.int32),
 ):
-    """Voxels that hold something synthetic, and those next to them."""
+    """Voxels whose sheets are told apart, and those next to them."""
     i = first + wp.tid()
     cell = key_cell(level_key_in[i], brick_extent(volume.n, level))
     mixed = int(0)
@@ -422,66 +416,3 @@ def _find_neighbours(
             if step[0] == 0 and step[1] == 0 and step[2] == 0:
                 best = i
         beside_out[NEIGHBOURS * i + k] = best
-
-
-@wp.func
-def backs(
-    patches: wp.array(dtype=Patch), table: wp.array(dtype=wp.int32), front: int, place: int, thickness: float
-) -> bool:
-    """Whether the patch at ``place`` of the table is the other side of the wall that ``front`` belongs to, no farther
-    behind it than ``thickness``."""
-    back = table[place]
-    if back < 0 or patches[back].area < WALL_AREA:
-        return False
-    behind = wp.dot(patches[front].position - patches[back].position, patches[front].normal)
-    return behind >= 0.0 and behind <= thickness and wp.dot(patches[back].normal, patches[front].normal) < OPPOSITE
-
-
-@wp.kernel
-def _find_walls(
-    first: int,
-    volume: Volume,
-    level: int,
-    level_first: int,
-    level_key_in: wp.array(dtype=wp.int32),
-    patches: wp.array(dtype=Patch),
-    table_in: wp.array(dtype=wp.int32),
-    wall_out: wp.array(dtype=wp.vec4),
-    found_out: wp.array(dtype=wp.int32),
-):
-    """The plane of a wall thinner than a quarter of a voxel: a face whose opposite, in its voxel or the next one
-    behind, shows a surface that looks the other way. 0 where there is none."""
-    i = first + wp.tid()
-    thickness = THIN * volume.voxel * float(1 << level)
-    cell = key_cell(level_key_in[i], brick_extent(volume.n, level))
-    wall_out[i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    found_out[i] = 0
-    most = float(WALL_AREA)
-    for face in range(6):
-        front = table_in[6 * i + face]
-        if front >= 0 and patches[front].area > most:
-            opposite = face ^ 1
-            step = wp.vec3i(0, 0, 0)
-            step[face / 2] = wp.where((face & 1) == 0, -1, 1)
-            next = find_record(volume, level, cell[0] + step[0], cell[1] + step[1], cell[2] + step[2]) - level_first
-            offset = wp.dot(patches[front].normal, patches[front].position)
-            found = False
-            if backs(patches, table_in, front, 6 * i + opposite, thickness):
-                # Both sides are in this voxel: the middle is between them.
-                back = table_in[6 * i + opposite]
-                offset = 0.5 * (offset + wp.dot(patches[front].normal, patches[back].position))
-                found = True
-            elif next >= 0:
-                found = backs(patches, table_in, front, 6 * next + opposite, thickness)
-            if found:
-                most = patches[front].area * CLEARLY
-                n = patches[front].normal
-                wall_out[i] = wp.vec4(n[0], n[1], n[2], offset)
-                found_out[i] = 1
-
-
-@wp.kernel
-def _wall_of_patches(first: int, field: BounceField, patch_out: wp.array(dtype=Patch)):
-    """The thin wall beside each patch."""
-    i = first + wp.tid()
-    patch_out[i].wall = wall_beside(field, off_surface(field, patch_out[i].position, patch_out[i].normal))

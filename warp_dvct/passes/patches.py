@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import patches as kernels
+from warp_dvct.kernels import walls as wall_kernels
 from warp_dvct.kernels.bounce_field import NEIGHBOURS, BounceField, Patch
 from warp_dvct.kernels.sorting import EMPTY_KEY
 from warp_dvct.kernels.volume import Volume
@@ -22,13 +23,14 @@ BURIED = 0.5  # voxels of level 0: a patch that something covers within that dis
 @dataclass(frozen=True)
 class Patches:
     """Surface patches behind the occupied faces of the voxels of a level: one a face and, in voxels that hold something
-    synthetic, one a sheet: real and synthetic surfaces are apart, and so are those that do not see each other.
+    synthetic or a thin wall, one a sheet: real and synthetic surfaces are apart, and so are those that do not see each
+    other.
 
     Attributes:
         voxels: The volume they were taken from. level, level_first: Its level, and that level's first record.
         data: ``kernels.bounce_field.Patch`` ``[count]``. count: How many.
         table: int ``[records of the level * 6]``, first patch of a face or -1.
-        mixed: int ``[records of the level]``, 1 where the voxel or one next to it holds something synthetic.
+        mixed: int ``[records of the level]``, 1 where the voxel or one next to it holds something synthetic or a wall.
         beside: int ``[count * 27]``, of patches in mixed voxels: the patch in each voxel around that they see, or -1.
         walls: vec4 ``[records of the level]``, planes of thin walls or 0. has_walls: Whether there are any.
     """
@@ -67,21 +69,29 @@ def choose_patches(launcher: Launcher, scene: DeviceScene, voxels: Voxels, norma
     while level + 1 < len(voxels.level_records) and 2 * voxels.level_records[level] > most:
         level += 1
     faces = _occupied_faces(launcher, voxels, level)
-    data, table, holds, count = _find_patches(launcher, scene, voxels, normals, faces)
     records = voxels.level_records[level]
     grid = [voxels.volume, level, faces.level_first]
-    mixed = launcher.zeros(max(1, records), wp.int32)
-    launcher.launch(kernels._mark_mixed, records, [*grid, voxels.level_keys[level], holds], [mixed])
-    beside = launcher.empty(max(1, NEIGHBOURS * count), wp.int32)
-    launcher.launch(kernels._find_neighbours, count, [scene.geometry, *grid, data, table, mixed], [beside])
+    keyed = [*grid, voxels.level_keys[level]]
+    occupied = launcher.zeros(max(1, 6 * records), wp.int32)
+    launcher.launch(wall_kernels._mark_occupied, faces.count, [faces.keys], [occupied])
+    apart = launcher.zeros(max(1, faces.count), wp.int32)
+    launcher.launch(wall_kernels._mark_opposite, faces.count, [*keyed, faces.keys, occupied], [apart])
+    if scene.geometry.has_synthetic:
+        entries = [faces.starts, faces.order, faces.entries, faces.count]
+        launcher.launch(kernels._mark_synthetic, faces.count, [scene.geometry, *entries, fragments_of(voxels)], [apart])
+    data, table, holds, count = _find_patches(launcher, scene, voxels, normals, faces, apart)
     walls = launcher.zeros(max(1, records), wp.vec4)
     found = launcher.zeros(max(1, records), wp.int32)
-    launcher.launch(kernels._find_walls, records, [*grid, voxels.level_keys[level], data, table], [walls, found])
+    launcher.launch(wall_kernels._find_walls, records, [*keyed, data, table], [walls, found])
     has_walls = bool(found.numpy().any())
+    mixed = launcher.zeros(max(1, records), wp.int32)
+    launcher.launch(kernels._mark_mixed, records, [*keyed, holds], [mixed])
+    beside = launcher.empty(max(1, NEIGHBOURS * count), wp.int32)
+    launcher.launch(kernels._find_neighbours, count, [scene.geometry, *grid, data, table, mixed], [beside])
     patches = Patches(voxels, level, faces.level_first, data, count, table, mixed, beside, walls, has_walls)
     if has_walls:
         launcher.launch(
-            kernels._wall_of_patches, count, [bounce_field(launcher, patches, launcher.zeros(1, wp.vec3))], [data]
+            wall_kernels._wall_of_patches, count, [bounce_field(launcher, patches, launcher.zeros(1, wp.vec3))], [data]
         )
     return patches
 
@@ -103,14 +113,15 @@ def _occupied_faces(launcher: Launcher, voxels: Voxels, level: int) -> _Faces:
 
 
 def _find_patches(
-    launcher: Launcher, scene: DeviceScene, voxels: Voxels, normals: Any, faces: _Faces
+    launcher: Launcher, scene: DeviceScene, voxels: Voxels, normals: Any, faces: _Faces, apart: Any
 ) -> tuple[Any, Any, Any, int]:
-    """The patches, the table of first patches, which voxels hold something synthetic, and the count."""
+    """The patches, the table of first patches, in which voxels there is one a sheet, and the count.
+
+    Args:
+        apart: int ``[faces]``, 1 where the sheets of a face's voxel are told apart.
+    """
     pieces, runs = fragments_of(voxels), faces.count
     entries = [faces.starts, faces.order, faces.entries, runs]
-    synthetic = launcher.zeros(max(1, runs), wp.int32)
-    if scene.geometry.has_synthetic:
-        launcher.launch(kernels._mark_synthetic, runs, [scene.geometry, *entries, pieces], [synthetic])
     sheets, places = kernels.Sheets(), max(1, int(kernels.MOST_SHEETS) * runs)
     sheets.fragment, sheets.buried = (launcher.zeros(places, wp.int32) for _ in range(2))
     sheets.eye = launcher.zeros(places, wp.vec3)
@@ -122,7 +133,7 @@ def _find_patches(
     launcher.launch(
         kernels._find_sheets,
         runs,
-        [scene.geometry, normals, faces.keys, *entries, voxels.area, pieces, near, lift, synthetic],
+        [scene.geometry, normals, faces.keys, *entries, voxels.area, pieces, near, lift, apart],
         [sheets, counts, holds],
     )
     ends, count = scan(launcher, counts)
