@@ -37,7 +37,7 @@ class BudgetOptions:
 
     budgets: tuple[float, ...] = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
     width: int = 320
-    samples: int = 96
+    samples: int = 384
     repeats: int = 1
     method: str = "delta-cones"
     settings: dict[str, str] = field(default_factory=dict)

@@ -24,6 +24,7 @@ from warp_dvct.accuracy import (
     DETAILS,
     FORMS,
     LADDERS_OF,
+    OVERLAP,
     REFERENCE,
     REFERENCE_OF,
     STRIDE,
@@ -68,22 +69,25 @@ def fit_table(rows: Sequence[Mapping[str, Any]]) -> tuple[Accuracy, list[tuple[s
     coefficients = _power_law(cones, surveys) | {"bounces": _bounces(cones, surveys)}
     vpls = sweeps["instant-radiosity"]
     coefficients |= _constants(vpls, surveys, coefficients)
-    tables = [Accuracy({**coefficients, "overlap": float(power)}, knobs, 0.0) for power in np.arange(0.1, 1.61, 0.05)]
+    kinds = {stage: kind_of(found) for stage, found in surveys.items()}
 
-    def compare(table: Accuracy, methods: Sequence[str]) -> list[tuple[str, float, float]]:
+    def compare(table: Accuracy, methods: Sequence[str], kind: str = "") -> list[tuple[str, float, float]]:
         return [
             (f"{method} {s} {w} {_name(method, settings)}", flip, table.error(settings, surveys[s], w, method))
             for method in methods
             for (s, w, settings), flip in sweeps[method].points.items()
-            if flip > LEAST and sweeps[method].base
+            if flip > LEAST and sweeps[method].base and kind in ("", kinds[s])
         ]
 
-    def spread(table: Accuracy) -> float:
-        pairs = compare(table, ["delta-cones"])
-        return float(np.sqrt(np.mean([math.log(m / max(p, 1e-9)) ** 2 for _, m, p in pairs])))
+    def spread(table: Accuracy, kind: str = "") -> float:
+        pairs = compare(table, ["delta-cones"], kind)
+        return float(np.sqrt(np.mean([math.log(m / max(p, 1e-9)) ** 2 for _, m, p in pairs]))) if pairs else 0.0
 
-    best = min(tables, key=spread)
-    return Accuracy(best.base, best.knobs, spread(best)), compare(best, list(LADDERS_OF))
+    for kind in ("diffuse", "glossy"):
+        powers = [{**coefficients, f"{kind} {OVERLAP}": float(power)} for power in np.arange(0.1, 1.61, 0.05)]
+        coefficients = min(powers, key=lambda base, kind=kind: spread(Accuracy(base, knobs, 0.0), kind))
+    best = Accuracy(coefficients, knobs, 0.0)
+    return replace(best, spread=spread(best)), compare(best, list(LADDERS_OF))
 
 
 def net_flip(row: Mapping[str, Any]) -> float:

@@ -44,7 +44,7 @@ KNOBS = (
     Knob("delta-cones", "volume.resolution", ("32", "64", "128", "256", "512")),
     Knob("delta-cones", "volume.coarse", ("32", "64", "128", "256")),
     Knob("delta-cones", "rsm.texels", ("128", "256", "512", "1024")),
-    Knob("delta-cones", "rsm.density", ("0.5", "1", "2")),
+    Knob("delta-cones", "rsm.density", ("0.5", "1", "2", "3")),
     Knob("delta-cones", "gather.rays", ("16", "32", "64", "128", "256"), ("gather.rays", "gather.object_rays")),
     Knob(
         "delta-cones",

@@ -121,7 +121,7 @@ def tradeoff(stages: tuple[str, ...], pairs: tuple[str, ...], cache: Path | None
 @click.option("--method", type=click.Choice(METHODS), default="delta-cones", show_default=True)
 @click.option("--set", "pairs", multiple=True, metavar="KEY=VALUE", help="A setting that is not chosen.")
 @click.option("--width", type=click.IntRange(min=16), default=320, show_default=True, help="Pixels across.")
-@click.option("--spp", "samples", type=int, default=96, show_default=True, help="Of the truth; 0 measures no error.")
+@click.option("--spp", "samples", type=int, default=384, show_default=True, help="Of the truth; 0 measures no error.")
 @click.option("--seed", type=int, default=1, show_default=True, help="Of the truth's random numbers.")
 @click.option("--cache", type=FILE, help="References; default: warp_dvct in the user's cache.")
 @click.option("--out", type=FILE, metavar="FILE", help="Add each row to this file of JSON lines at once.")

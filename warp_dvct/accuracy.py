@@ -42,6 +42,7 @@ REFERENCE = {
 CLOSED = 0.8  # share of gathered rays that meet a surface: above it a scene counts as a closed room
 STRIDE, DETAIL, RAYS, VPLS = "gather.stride", "gather.detail", "gather.rays", "vpls.count"
 DENSITY, CONES, BOUNCES = "rsm.density", "cones.count", "bounces"
+OVERLAP = "overlap"
 FORMS = {"gather": "cones", "shadows": "cone", "glossy": "cones"}  # settings that may ask for cones
 FINE_SHARE = 0.25  # of what too few texels cost, that of the fine volume; the coarse one lights most of what is seen
 LEAST_DECAY = 0.05  # of light from bounce to bounce; less is not told from none
@@ -107,9 +108,9 @@ class Accuracy:
     """What was measured of errors.
 
     Attributes:
-        base: Coefficients of the logarithm of FLIP at the reference, see :meth:`reference`; ``overlap``, the power by
-            which improvements of several knobs together fall short of their product; ``bounces``, FLIP of missing
-            bounces over ``Survey.later``.
+        base: Coefficients of the logarithm of FLIP at the reference, see :meth:`reference`; ``diffuse overlap`` and
+            ``glossy overlap``, the powers by which improvements of several knobs together fall short of their product;
+            ``bounces``, FLIP of missing bounces over ``Survey.later``.
         knobs: By class of scene and knob: values, and by how much squared FLIP exceeds that of ``REFERENCE``, over it.
             Knobs of patches go by ``open`` and ``closed`` scenes, the others by ``diffuse`` and ``glossy`` ones.
             Strides have a table for each of ``DETAILS`` (:func:`stride_table`); forms that ask for cones one of a
@@ -135,16 +136,16 @@ class Accuracy:
             return 0.0
         found = [self.excess(ladder.knob, settings, survey, method) for ladder in LADDERS_OF[method]]
         found += self.forms(settings, survey, method)
-        return self.reference(survey, width, method) * math.sqrt(self.combined(found))
+        return self.reference(survey, width, method) * math.sqrt(self.combined(found, survey))
 
-    def combined(self, excesses: Iterable[float]) -> float:
+    def combined(self, excesses: Iterable[float], survey: Survey) -> float:
         """Squared FLIP over that at the reference, of settings whose knobs one by one exceed it by these."""
         factor, added = 1.0, 0.0
         for excess in excesses:
             # Independent errors add up; what improves takes a share off the reference's own, and these overlap.
             added += max(excess, 0.0)
             factor *= 1.0 + min(excess, 0.0)
-        return factor ** self.base["overlap"] + added
+        return factor ** self.base[f"{kind_of(survey)} {OVERLAP}"] + added
 
     def excess(self, knob: str, settings: Settings, survey: Survey, method: str = "delta-cones") -> float:
         """Of squared FLIP over that at the reference, where only ``knob`` is as in ``settings``."""

@@ -206,7 +206,7 @@ class _Chooser:
         if not self.survey.changes:
             return 0.0
         found = (self.excess(ladder.knob, settings) for ladder in LADDERS_OF[self.method])
-        return self.reference**2 * self.accuracy.combined((*found, *self.forms))
+        return self.reference**2 * self.accuracy.combined((*found, *self.forms), self.survey)
 
     def excess(self, knob: str, settings: Settings) -> float:
         """As ``Accuracy.excess``, looked up once."""

@@ -89,7 +89,9 @@ class Settings:
     patches_count: int = _knob(8192, "about how many patches carry the second and further bounces", low=8, high=2**22)
     patches_rays: int = _knob(64, "rays per patch", low=1, high=65536)
 
-    visibility: str = _knob("ism", "how VPLs on surfaces see: imperfect shadow maps or exact rays", choices=("ism", "ray"))
+    visibility: str = _knob(
+        "ism", "how VPLs on surfaces see: imperfect shadow maps or exact rays", choices=("ism", "ray")
+    )
     shadow_maps: str = _knob(
         "double", "maps of real and synthetic surfaces apart, or the single one of 2010", choices=("double", "single")
     )

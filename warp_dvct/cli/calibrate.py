@@ -18,7 +18,7 @@ from warp_dvct.image import check_writable
 @click.option("--seed", type=int, default=1, show_default=True, help="Of the settings that are drawn.")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="Write the model there instead.")
 def calibrate(device: str, threads: int | None, frames: int, seed: int, out: Path | None) -> None:
-    """Measure what frames cost on this machine; `relight --budget` then keeps its word. Takes about two minutes."""
+    """Measure what frames cost on this machine; `relight --budget` then keeps its word. Takes two to three minutes."""
     if out is not None:
         check_writable(out)
     start_warp(device)
