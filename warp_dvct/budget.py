@@ -38,6 +38,7 @@ from warp_dvct.survey import Survey
 
 AIM = 0.95  # of the budget, for the settings' prediction; what is left when rays are settled goes into them
 VOXELS_PER_FEATURE = 2.0  # across the smallest extent of an object, for its light not to pass through it
+AHEAD = 3  # values of a ladder that a step may take at once: the next one alone may gain nothing
 NEARLY = 0.9  # of what is aimed at: a choice that takes less has nothing more to gain
 SHOWS = 0.005  # of an error: what doubling the rays has to take off it to be worth their time
 # What the errors of a knob's values depend on besides.
@@ -292,12 +293,14 @@ class _Chooser:
                 return state, last, "the error is reached"
             best, gain, full = None, 0.0, False
             for ladder in self.ladders:
-                for value in ladder.values[ladder.values.index(state[ladder.knob]) + 1 :]:
+                next_ = ladder.values.index(state[ladder.knob]) + 1
+                for value in ladder.values[next_ : next_ + AHEAD]:
                     candidate = {**state, ladder.knob: value}
                     made = self.settings(candidate)
-                    more, less = self.seconds(made) - time, square - self.square(made)
+                    less = square - self.square(made)
                     if less <= 1e-4 * square:
                         continue
+                    more = self.seconds(made) - time
                     if time + more > aim:
                         full = True
                         break
