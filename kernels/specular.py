@@ -5,7 +5,7 @@ import warp as wp
 from warp_dvct.kernels.bounce_field import BounceField, bounced_irradiance
 from warp_dvct.kernels.cones import ConeSettings
 from warp_dvct.kernels.environment import environment_radiance
-from warp_dvct.kernels.gather import cone_incident, diffuse_reflectance, hit_incident, ray_incident
+from warp_dvct.kernels.gather import cone_incident, diffuse_reflectance, hit_incident, inverse_distance, ray_incident
 from warp_dvct.kernels.gbuffer import BACKGROUND, UNSEEN, Points, first_sample, load_surface, share_of
 from warp_dvct.kernels.geometry import (
     FAR,
@@ -18,6 +18,7 @@ from warp_dvct.kernels.geometry import (
 )
 from warp_dvct.kernels.glossy_hits import FOCUSING
 from warp_dvct.kernels.lights import ADDED, DOME, Lights, light_along_ray, sample_light
+from warp_dvct.kernels.lobe_smoothing import Reflected
 from warp_dvct.kernels.materials import (
     Materials,
     Surface,
@@ -166,6 +167,8 @@ def reflected_along(
     result = Incident()
     real = trace_real(geo, origin, direction, FAR)
     synthetic = trace_synthetic(geo, origin, direction, real.t)
+    result.distance_before = real.t
+    result.distance_after = synthetic.t
     samples = float(glossy.light_samples)
     rays = density * float(glossy.rays)
     shade_real = real.found != 0 and (with_before != 0 or synthetic.found == 0)
@@ -207,17 +210,16 @@ def _shade_specular_rays(
     bounces: BounceField,
     lights: Lights,
     glossy: Glossy,
-    with_before: int,
-    light_out: wp.array(dtype=wp.vec3),
-    before_out: wp.array(dtype=wp.vec3),
+    reflected_out: Reflected,
 ):
-    """Add the GGX lobe's reflections by exact rays with visible-normal sampling (eq. 6's second term)."""
+    """The GGX lobe's reflections by exact rays with visible-normal sampling (eq. 6's second term)."""
     i = first + wp.tid()
     j = index_in[i]
     s = load_surface(points, j)
     wo = points.view[j]
     before = wp.vec3(0.0, 0.0, 0.0)
     after = wp.vec3(0.0, 0.0, 0.0)
+    nearness = float(0.0)
     rays = share_of(glossy.rays, points, j, glossy.edge_samples)
     start = first_sample(glossy.rays, rays, 1, points, j)
     for k in range(start, start + rays):
@@ -230,14 +232,15 @@ def _shade_specular_rays(
             light = reflected_along(
                 geo, mats, world, bounces, lights, origin, direction, density, glossy, blurred, 1 - s.synthetic, 0, k
             )
+            nearness += inverse_distance(light)
             after += wp.cw_mul(weight, light.after)
             if s.synthetic == 0:
                 before += wp.cw_mul(weight, light.before)
     after = after / float(rays)
     before = before / float(rays)
-    light_out[j] += after - before
-    if with_before != 0:
-        before_out[j] += before
+    reflected_out.change[i] = after - before
+    reflected_out.before[i] = before
+    reflected_out.nearness[i] = nearness / float(rays)
 
 
 @wp.kernel

@@ -84,6 +84,9 @@ class Settings:
 
     glossy: str = _knob("rays", "how specular reflections are found", choices=("rays", "cones"))
     glossy_rays: int = _knob(8, "rays per shading point with a specular lobe", low=1, high=65536)
+    glossy_smoothing: float = _knob(
+        0.3, "width over which neighbours' rays are averaged, over that of the lobe's blur", low=0.0, high=4.0
+    )
     glossy_roughness: float = _knob(0.7, "rougher lobes are folded into the diffuse gather", low=0.0, high=1.0)
 
     patches_count: int = _knob(8192, "about how many patches carry the second and further bounces", low=8, high=2**22)
@@ -140,6 +143,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "gather.detail": 0.0,
         "gather.object_rays": 16,
         "glossy.rays": 2,
+        "glossy.smoothing": 0.5,
         "patches.count": 512,
         "patches.rays": 32,
         "samples": 16,
@@ -158,6 +162,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "gather.object_rays": 192,
         "gather.object_stride": 2,
         "glossy.rays": 32,
+        "glossy.smoothing": 0.2,
         "patches.count": 16384,
         "patches.rays": 128,
         "samples": 512,

@@ -52,7 +52,7 @@ def measure_all(launcher: Any) -> list[Deviation]:
         *(surfaces.measure_gbuffer, direct.measure_rsm, direct.measure_direct),
         *(direct.measure_path_tracing, volumes.measure_voxels, volumes.measure_injection, volumes.measure_pyramid),
         *(indirect.measure_cones, indirect.measure_rays, glossy.measure_glossy_rays),
-        *(indirect.measure_specular, indirect.measure_bounces),
+        *(indirect.measure_specular, glossy.measure_lobe_smoothing, indirect.measure_bounces),
         *(volumes.measure_albedos, surfaces.measure_indirect_shading),
         indirect.measure_reconstruction,
         *(vpls.measure_warping, vpls.measure_vpls, vpls.measure_vpl_bounces, frames.measure_history),

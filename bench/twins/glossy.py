@@ -1,4 +1,4 @@
-"""Twin of what glossy surfaces send along gathered rays (``kernels/glossy_hits.py``), under a light without extent."""
+"""Twins of what glossy surfaces send along gathered rays, under a light without extent, and of averaged reflections."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ import warp as wp
 
 from warp_dvct.bench.twins.deviation import Deviation, compare
 from warp_dvct.bench.twins.direct import sample_light, seen
-from warp_dvct.bench.twins.indirect import COUNT, RAYS, GatherRay, incident, places, world_of
+from warp_dvct.bench.twins.indirect import COUNT, RAYS, GatherRay, blank_points, falloff, incident, places, world_of
 from warp_dvct.bench.twins.numbers import dot
 from warp_dvct.bench.twins.stage import POINT, make_scene
 from warp_dvct.bench.twins.surfaces import Surfaces, brdf_cos, specular_albedo
 from warp_dvct.bench.twins.volumes import fields, lit
-from warp_dvct.kernels import gather
+from warp_dvct.kernels import gather, lobe_smoothing
 from warp_dvct.passes.gather import Gatherer, glossy_hits
 from warp_dvct.passes.patches import bounce_field
+from warp_dvct.passes.specular import lobe_grid
 from warp_dvct.scene import Material
 
 MATERIALS = (
@@ -79,3 +80,59 @@ def glossy_surfaces(ray: GatherRay, distance: np.ndarray, triangle: np.ndarray, 
     s.f0, s.f90 = np.full(s.position.shape, f0), np.full(len(distance), min(50.0 * f0, 1.0))
     s.alpha = np.full(len(distance), material.roughness**2)
     return s
+
+
+def measure_lobe_smoothing(launcher: Any) -> list[Deviation]:
+    """The mean of reflections over a bent sheet of pixels, every tap by a matrix of weights."""
+    rng = np.random.default_rng(12)
+    columns, rows = 13, 9
+    count = columns * rows
+    x, y = np.arange(count) % columns, np.arange(count) // columns
+    place = np.stack([x, y, 0 * x], 1) * 0.01 + rng.normal(0, 2e-3, (count, 3))
+    normal = rng.normal(0, 0.03, (count, 3)) + np.array([0.0, 0.0, 1.0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    alpha = rng.choice([0.2, 0.205, 0.3], count)
+    role = rng.integers(0, 5, count) // 4
+    f0 = rng.uniform(0.3, 0.36, (count, 3))
+    listed = np.flatnonzero(rng.random(count) < 0.9).astype(np.int32)
+    rank = np.full(count, -1, np.int32)
+    rank[listed] = np.arange(len(listed))
+    change, near = rng.normal(0, 1, (len(listed), 3)), rng.uniform(2.0, 6.0, len(listed))
+    points = blank_points(launcher, count)
+    points.position = launcher.array(place.astype(np.float32), wp.vec3)
+    points.normal = points.normal_g = launcher.array(normal.astype(np.float32), wp.vec3)
+    points.pixel = launcher.array(np.stack([x, y], 1).astype(np.int32), wp.vec2i)
+    points.lobe = launcher.array(np.stack([0 * alpha + 1, alpha], 1).astype(np.float32), wp.vec2)
+    points.f0 = launcher.array(f0.astype(np.float32), wp.vec3)
+    points.role = launcher.array(role.astype(np.int32), wp.int32)
+    points.footprint = launcher.full(count, 0.01, wp.float32)
+    reflected = lobe_smoothing.Reflected()
+    reflected.change = reflected.before = launcher.array(change.astype(np.float32), wp.vec3)
+    reflected.nearness = launcher.array(near.astype(np.float32), wp.float32)
+    grid = lobe_grid(launcher.array(rank, wp.int32), columns, rows)
+    index = launcher.array(listed, wp.int32)
+    eye, share = np.array([0.05, 0.05, 1.5]), 0.4
+    light, before = (launcher.zeros(count, wp.vec3) for _ in range(2))
+    given = [points, index, grid, wp.vec3(*eye), share, reflected, 1]
+    launcher.launch(lobe_smoothing._smooth_lobes, len(listed), given, [light, before])
+
+    place, normal, alpha, role, f0 = (v[listed] for v in (place, normal, alpha, role, f0))
+    step = np.stack([x, y], 1)[listed][None] - np.stack([x, y], 1)[listed][:, None]
+    around = (np.abs(step).max(-1) <= 1) & (role[:, None] == role[None])
+    distance = around.sum(1) / (around @ near)
+    width = share * 2.0 * alpha * distance / (1.0 + distance / np.linalg.norm(place - eye, axis=1))
+    spacing = np.clip((0.5 * width / 0.01).astype(int), 1, 4)[:, None, None]
+    tap = (step % spacing == 0).all(-1) & (np.abs(step) <= 2 * spacing).all(-1) & (width > 0.005)[:, None]
+    tap &= (role[:, None] == role[None]) & (np.abs(alpha[None] - alpha[:, None]) <= 0.05 * alpha[:, None])
+    tap &= np.abs(f0[None] - f0[:, None]).max(-1) <= 0.05
+    offset = place[None] - place[:, None]
+    turn = ((normal[None] - normal[:, None]) ** 2).sum(-1) / (0.25 * alpha[:, None]) ** 2
+    gap = np.einsum("ijx,ix->ij", offset, normal) / 0.02
+    weight = falloff((offset**2).sum(-1) / width[:, None] ** 2) * falloff(turn) * falloff(gap**2) * tap
+    np.fill_diagonal(weight, 1.0)
+    mean = weight @ change / weight.sum(1, keepdims=True)
+    kernel = lobe_smoothing._smooth_lobes
+    return [
+        compare(kernel, "light", light.numpy()[listed], mean),
+        compare(kernel, "before", before.numpy()[listed], np.where((role == 0)[:, None], mean, 0.0)),
+    ]

@@ -38,7 +38,7 @@ def test_every_family_of_the_picture_has_a_twin(rows):
     assert families >= {
         *("gbuffer", "rsm", "shading", "path_tracing", "voxelization", "injection", "pyramid", "gather", "specular"),
         *("bounces", "reconstruction", "warping", "vpl_shading", "vpls", "ism", "resolve", "composite", "tonemap"),
-        *("difference", "history", "vpl_bounces", "lens", "light_fit"),
+        *("difference", "history", "vpl_bounces", "lens", "light_fit", "lobe_smoothing"),
     }
     assert "_gather_rays_glossy" in {row.kernel for row in rows}
     assert families <= {name.rpartition(".")[2] for name in kernel_modules()}

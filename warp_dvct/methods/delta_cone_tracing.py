@@ -39,7 +39,7 @@ from warp_dvct.passes.pyramid import build_pyramid, light_faces
 from warp_dvct.passes.resolve import resolve
 from warp_dvct.passes.rsm import render_real, render_rsm
 from warp_dvct.passes.shading import direct_settings, shade_direct
-from warp_dvct.passes.specular import find_glossy, shade_specular
+from warp_dvct.passes.specular import find_glossy, lobe_grid, shade_specular
 from warp_dvct.passes.voxels import Voxels, cut_triangles, part, voxelize
 from warp_dvct.plan import Plan
 from warp_dvct.scene import LightKind, Role, Scene
@@ -164,7 +164,7 @@ def render(
                     )
             if plan.glossy:
                 with launcher.scope("specular"):
-                    _shade_specular(launcher, device_scene, plan, light_field, part)
+                    _shade_specular(launcher, device_scene, plan, light_field, buffer, part)
     with launcher.scope("resolve"):
         return resolve(
             launcher,
@@ -386,9 +386,12 @@ def _irradiance(
     return irradiance
 
 
-def _shade_specular(launcher: Launcher, scene: DeviceScene, plan: Plan, light_field: LightField, part: _Part) -> None:
+def _shade_specular(
+    launcher: Launcher, scene: DeviceScene, plan: Plan, light_field: LightField, buffer: GBuffer, part: _Part
+) -> None:
     settings = plan.settings
-    index, count = find_glossy(launcher, part.points, part.count, plan.alpha_max)
+    rank, index, count = find_glossy(launcher, part.points, part.count, plan.alpha_max)
+    grid = lobe_grid(rank, buffer.width, buffer.height) if part.points is buffer.points else None
     glossy = specular.Glossy()
     glossy.rays = settings.glossy_rays
     glossy.edge_samples = max(1, settings.antialias)
@@ -410,4 +413,6 @@ def _shade_specular(launcher: Launcher, scene: DeviceScene, plan: Plan, light_fi
         light=part.light,
         before=part.before,
         with_before=part.with_before,
+        grid=grid,
+        smoothing=settings.glossy_smoothing,
     )

@@ -405,7 +405,7 @@ class _Shader:
         glossy = specular.Glossy()
         glossy.rays, glossy.light_samples, glossy.seed = settings.glossy_rays, settings.shadows_samples, settings.seed
         glossy.alpha_max, glossy.again = plan.alpha_max, int(settings.bounces > 0)
-        index, found = find_glossy(self.launcher, points, count, plan.alpha_max)
+        _, index, found = find_glossy(self.launcher, points, count, plan.alpha_max)
         # What a reflection shows has made one bounce already: the last bounce's VPLs would be one too many.
         ends = self.lights.ends
         shown = replace(self._source, vpls=first_vpls(self.lights.vpls, ends[max(0, len(ends) - 2)]))
