@@ -10,6 +10,8 @@ import pytest
 from known_costs import chosen, made_model
 
 from warp_dvct import Relighter
+from warp_dvct.accuracy import load_accuracy
+from warp_dvct.budget import SHOWS
 from warp_dvct.cost import PROBE, price
 from warp_dvct.pace import BELIEVED, LATER, Pace, try_machine, with_rays
 from warp_dvct.settings import Settings
@@ -72,6 +74,19 @@ def test_settled_rays_have_bounds(surveys, monkeypatch):
         assert choice.pace.settle(machine, None, None, None, choice.settings).gather_rays == getattr(choice.pace, bound)
     assert choice.enough
     assert choice.pace.most == choice.settings.gather_rays
+
+
+def test_no_more_rays_than_show_are_settled(surveys):
+    """Planned for a slow machine, a frame of one bounce that is fast after all gathers no more than one would see."""
+    usual = chosen(surveys, seconds=2.0)
+    floor = usual.floor
+    cheapest = chosen(surveys, seconds=1.1 * floor, slowness=3.0)
+    assert cheapest.settings.bounces == 1
+    assert 2 * cheapest.settings.gather_rays <= cheapest.pace.most <= 256
+    assert usual.pace.most >= 2 * usual.settings.gather_rays
+    table, found = load_accuracy(), surveys["room_area"]
+    many, more = (table.error(with_rays(cheapest.settings, n * cheapest.pace.most), found, 320) for n in (1, 2))
+    assert more >= (1.0 - SHOWS) * many
 
 
 @pytest.mark.parametrize("request_", [{"max_error": 0.05}, {"seconds": 2.0, "fixed": {"gather.rays": 64}}])
