@@ -7,11 +7,13 @@ Knecht et al. 2012, eqs. 1-8. r(p) and r(VPL) are roles, ir the flag ``hidden``,
 import warp as wp
 
 from warp_dvct.kernels.environment import Environment, environment_radiance
+from warp_dvct.kernels.gather import inverse_distance
 from warp_dvct.kernels.gbuffer import BACKGROUND, REAL, SYNTHETIC, Points, load_surface
 from warp_dvct.kernels.geometry import FAR, Geometry, trace_real, trace_synthetic
 from warp_dvct.kernels.glossy_hits import domes_in_lobe, lights_in_lobe
 from warp_dvct.kernels.ism import AFTER, ALL, CHANGE, RAY_END, Sight, map_sight, ray_sight
 from warp_dvct.kernels.lights import ADDED, DOME, Lights, sample_light
+from warp_dvct.kernels.lobe_smoothing import Reflected
 from warp_dvct.kernels.materials import (
     Materials,
     Surface,
@@ -22,6 +24,7 @@ from warp_dvct.kernels.materials import (
     spawn_point,
     surface_at,
 )
+from warp_dvct.kernels.radiosity import Incident
 from warp_dvct.kernels.sampling import INV_PI, sobol2, uniform1
 from warp_dvct.kernels.shading import SHADOW_END, Direct, look, reflect_visible, reflected, vndf_pdf
 from warp_dvct.kernels.specular import Glossy, lights_along
@@ -342,14 +345,16 @@ def seen_along(
     is_real: int,
     index: int,
     sample: int,
-) -> Pair:
+) -> Incident:
     """Radiance along a glossy ray; ``before`` is 0 where the ray starts on a synthetic surface.
 
     ``density`` is that of all rays together, per solid angle.
     """
-    seen = Pair()
+    seen = Incident()
     real = trace_real(geo, origin, direction, FAR)
     synthetic = trace_synthetic(geo, origin, direction, real.t)
+    seen.distance_before = real.t
+    seen.distance_after = synthetic.t
     hits = int(2)  # one call in a loop at run time: two would spill on GPUs
     for n in range(hits):
         hit = real
@@ -392,11 +397,9 @@ def _shade_glossy(
     vpls: Vpls,
     sight: Sight,
     glossy: Glossy,
-    with_before: int,
-    light_out: wp.array(dtype=wp.vec3),
-    before_out: wp.array(dtype=wp.vec3),
+    reflected_out: Reflected,
 ):
-    """Add the GGX lobe's reflections by rays with visible-normal sampling; VPLs would show as spots in it.
+    """The GGX lobe's reflections by rays with visible-normal sampling; VPLs would show as spots in it.
 
     ``vpls`` are those that may light what a ray meets: one bounce less than light diffuse surfaces. ``glossy.again`` is
     0 where surfaces are not to be seen at all: direct light only.
@@ -407,6 +410,7 @@ def _shade_glossy(
     wo = points.view[j]
     before = wp.vec3(0.0, 0.0, 0.0)
     after = wp.vec3(0.0, 0.0, 0.0)
+    nearness = float(0.0)
     is_real = wp.where(points.role[j] == SYNTHETIC, 0, 1)
     for k in range(glossy.rays):
         direction = reflect_visible(s, wo, sobol2(glossy.seed, j, k, 17))
@@ -416,13 +420,14 @@ def _shade_glossy(
             origin = spawn_point(s, direction)
             density = pdf * float(glossy.rays)
             seen = seen_along(geo, mats, lights, env, vpls, sight, origin, direction, density, glossy, is_real, j, k)
+            nearness += inverse_distance(seen)
             after += wp.cw_mul(weight, seen.after)
             before += wp.cw_mul(weight, seen.before)
     after = after / float(glossy.rays)
     before = before / float(glossy.rays)
-    light_out[j] += after - before
-    if with_before != 0:
-        before_out[j] += before
+    reflected_out.change[i] = after - before
+    reflected_out.before[i] = before
+    reflected_out.nearness[i] = nearness / float(glossy.rays)
 
 
 @wp.kernel

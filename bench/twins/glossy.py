@@ -17,8 +17,8 @@ from warp_dvct.bench.twins.surfaces import Surfaces, brdf_cos, specular_albedo
 from warp_dvct.bench.twins.volumes import fields, lit
 from warp_dvct.kernels import gather, lobe_smoothing
 from warp_dvct.passes.gather import Gatherer, glossy_hits
+from warp_dvct.passes.lobe_smoothing import lobe_grid
 from warp_dvct.passes.patches import bounce_field
-from warp_dvct.passes.specular import lobe_grid
 from warp_dvct.scene import Material
 
 MATERIALS = (

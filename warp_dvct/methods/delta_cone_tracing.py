@@ -34,12 +34,13 @@ from warp_dvct.passes.gather import (
 )
 from warp_dvct.passes.gbuffer import GBuffer, new_view, render_gbuffer
 from warp_dvct.passes.injection import empty_flux, inject
+from warp_dvct.passes.lobe_smoothing import Smoothing, lobe_grid
 from warp_dvct.passes.patches import bounce_field, choose_patches
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
 from warp_dvct.passes.resolve import resolve
 from warp_dvct.passes.rsm import render_real, render_rsm
 from warp_dvct.passes.shading import direct_settings, shade_direct
-from warp_dvct.passes.specular import find_glossy, lobe_grid, shade_specular
+from warp_dvct.passes.specular import find_glossy, shade_specular
 from warp_dvct.passes.voxels import Voxels, cut_triangles, part, voxelize
 from warp_dvct.plan import Plan
 from warp_dvct.scene import LightKind, Role, Scene
@@ -391,7 +392,7 @@ def _shade_specular(
 ) -> None:
     settings = plan.settings
     rank, index, count = find_glossy(launcher, part.points, part.count, plan.alpha_max)
-    grid = lobe_grid(rank, buffer.width, buffer.height) if part.points is buffer.points else None
+    size = (buffer.width, buffer.height) if part.points is buffer.points else (0, 0)
     glossy = specular.Glossy()
     glossy.rays = settings.glossy_rays
     glossy.edge_samples = max(1, settings.antialias)
@@ -413,6 +414,5 @@ def _shade_specular(
         light=part.light,
         before=part.before,
         with_before=part.with_before,
-        grid=grid,
-        smoothing=settings.glossy_smoothing,
+        smoothing=Smoothing(lobe_grid(rank, *size), settings.glossy_smoothing),
     )

@@ -25,6 +25,7 @@ from warp_dvct.passes.gather import shade_indirect
 from warp_dvct.passes.gbuffer import GBuffer, render_gbuffer
 from warp_dvct.passes.history import Blender, History
 from warp_dvct.passes.ism import draw_isms, new_isms, ray_sight
+from warp_dvct.passes.lobe_smoothing import Smoothing, lobe_grid
 from warp_dvct.passes.point_cloud import SurfacePoints, sample_surfaces
 from warp_dvct.passes.resolve import resolve
 from warp_dvct.passes.shading import direct_settings, shade_direct
@@ -331,7 +332,7 @@ class _Shader:
 
     def _shade_buffer(self, buffer: GBuffer, light: Any, before: Any) -> None:
         """Write the light of all points: after on synthetic ones, after - before on real ones, and before."""
-        self._seen(buffer.points, buffer.count, light, before)
+        self._seen(buffer.points, buffer.count, light, before, (buffer.width, buffer.height))
         if self.blender is not None:
             self.blender.seen("light", light)
             self.blender.seen("before", before)
@@ -358,13 +359,13 @@ class _Shader:
             self.device_scene, self.lights.vpls, self.lights.sight, self.plan.settings.vpls_tiles, self.with_before
         )
 
-    def _seen(self, points: Any, count: int, light: Any, before: Any) -> None:
-        """Write direct light and add glossy reflections."""
+    def _seen(self, points: Any, count: int, light: Any, before: Any, size: tuple[int, int] = (0, 0)) -> None:
+        """Write direct light and add glossy reflections, averaged over the pixels of a picture of ``size``."""
         with self.launcher.scope("direct"):
             self._direct(points, count, light, before)
         if self.plan.glossy and (self.plan.settings.bounces or self.lights.env.levels):
             with self.launcher.scope("glossy"):
-                self._glossy(points, count, light, before)
+                self._glossy(points, count, light, before, size)
 
     def _reflect(self, points: Any, count: int, irradiance: tuple[Any, Any], light: Any, before: Any) -> None:
         """Add diffusely reflected irradiance."""
@@ -400,16 +401,19 @@ class _Shader:
         else:
             shade_direct(self.launcher, self.device_scene, points, count, direct, light=light, before=before)
 
-    def _glossy(self, points: Any, count: int, light: Any, before: Any) -> None:
+    def _glossy(self, points: Any, count: int, light: Any, before: Any, size: tuple[int, int]) -> None:
         plan, settings = self.plan, self.plan.settings
         glossy = specular.Glossy()
         glossy.rays, glossy.light_samples, glossy.seed = settings.glossy_rays, settings.shadows_samples, settings.seed
         glossy.alpha_max, glossy.again = plan.alpha_max, int(settings.bounces > 0)
-        _, index, found = find_glossy(self.launcher, points, count, plan.alpha_max)
+        rank, index, found = find_glossy(self.launcher, points, count, plan.alpha_max)
         # What a reflection shows has made one bounce already: the last bounce's VPLs would be one too many.
         ends = self.lights.ends
         shown = replace(self._source, vpls=first_vpls(self.lights.vpls, ends[max(0, len(ends) - 2)]))
-        shade_glossy(self.launcher, shown, self.lights.env, points, index, found, glossy, out=light, before=before)
+        smoothing = Smoothing(lobe_grid(rank, *size), settings.glossy_smoothing)
+        shade_glossy(
+            self.launcher, shown, self.lights.env, points, index, found, glossy, smoothing, out=light, before=before
+        )
 
 
 def first_vpls(vpls: Any, count: int) -> Any:

@@ -12,6 +12,7 @@ from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import vpl_shading
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.gbuffer import GBuffer, compact
+from warp_dvct.passes.lobe_smoothing import Smoothing, add_reflected, new_reflected
 
 PLANE_TOLERANCE = 0.5  # distance off the tangent plane, in tiles, at which a neighbour counts 1/e
 NORMAL_SHARPNESS = 8.0  # exponent of the normals' cosine
@@ -135,12 +136,14 @@ def shade_glossy(
     index: Any,
     count: int,
     glossy: Any,
+    smoothing: Smoothing,
     *,
     out: Any,
     before: Any,
 ) -> None:
     """Add reflections in glossy surfaces, by rays, to ``out`` (and ``before``) at the points listed in ``index``."""
     scene = light.scene
+    reflected = new_reflected(launcher, count)
     launcher.launch(
         vpl_shading._shade_glossy,
         count,
@@ -154,10 +157,11 @@ def shade_glossy(
             light.vpls,
             light.sight,
             glossy,
-            int(light.with_before),
         ],
-        [out, before],
+        [reflected],
     )
+    to = {"light": out, "before": before, "with_before": light.with_before}
+    add_reflected(launcher, scene, points, index, count, reflected, smoothing, **to)
 
 
 @dataclass(frozen=True)
