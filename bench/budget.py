@@ -23,6 +23,7 @@ from warp_dvct.cost import load_model
 from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher
 from warp_dvct.metrics import flip_ldr, import_flip
+from warp_dvct.settings import make_settings
 
 KIND = "budget"
 LATEST = 1.25  # of the budget: never later
@@ -59,12 +60,14 @@ def measure(
         report: Called with each row as soon as it is measured, and with whether it was known.
         known: Rows by their ``key``, which are not measured again.
     Raises:
-        OptionError: No budget, one that is not a positive number, no repeat, or as the relighter raises.
+        OptionError: No budget, one that is not a positive number, no repeat, a setting that there is not, or as the
+            relighter raises.
     """
     if not options.budgets or options.repeats < 1:
         raise OptionError("there is no budget to keep; give --budget SECONDS, and --repeats of at least 1")
     for budget in options.budgets:
         check_request(budget, None)
+    make_settings("balanced", options.settings)  # what is wrong in them is no budget's fault
     if options.samples:
         import_flip()
     bench = _Bench(stage, options)

@@ -118,6 +118,14 @@ def test_what_is_no_budget_is_refused_before_the_work(budget, tmp_path, monkeypa
         CliRunner().invoke(bench, words, catch_exceptions=False)
 
 
+@pytest.mark.parametrize("pair", ["gather=cone", "gather.ray=3", "bounces=-1"])
+def test_a_wrong_setting_is_no_budget_below_the_floor(pair, tmp_path):
+    words = ["budget", "--stage", "colour_bleeding", "--width", "48", "--spp", "0", "--budget", "1", "--set", pair]
+    with pytest.raises(OptionError, match=pair.split("=")[0]):
+        CliRunner().invoke(bench, [*words, "--out", str(tmp_path / "rows.jsonl")], catch_exceptions=False)
+    assert not (tmp_path / "rows.jsonl").exists()
+
+
 def sweep_row(stage: str, flip: float, noise: float = 0.0, **settings) -> dict:
     """A point of a sweep with a known error."""
     pairs = {k.replace("__", "."): v for k, v in settings.items()}
