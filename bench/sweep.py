@@ -21,19 +21,19 @@ from warp_dvct.layers import Layers
 from warp_dvct.metrics import affected_mask, flip_ldr, import_flip, smooth_delta
 from warp_dvct.scene import Scene
 
-# Joint quality: the name is a factor on the rays, 1 being about the balanced preset at one bounce.
+# Joint quality: the name is a factor on the rays, 1 being the balanced preset.
 _KNOBS = (
-    *("gather.rays", "gather.object_rays", "gather.stride", "gather.object_stride", "gather.smoothing"),
-    *("rsm.texels", "rsm.density", "shadows.samples", "shadows.probes", "glossy.rays", "patches.count"),
-    *("volume.resolution", "volume.coarse", "antialias"),
+    *("gather.rays", "gather.object_rays", "gather.stride", "gather.object_stride", "gather.detail"),
+    *("gather.smoothing", "rsm.texels", "rsm.density", "shadows.samples", "shadows.probes"),
+    *("glossy.rays", "glossy.smoothing", "patches.count", "volume.resolution", "volume.coarse", "antialias"),
 )
 _CURVE = {
-    "1/4": (16, 16, 12, 6, 1, 128, 1, 4, 4, 2, 1024, 64, 32, 2),
-    "1/2": (32, 32, 8, 4, 1, 256, 1, 8, 4, 4, 4096, 128, 64, 3),
-    "1": (64, 64, 6, 3, 1, 512, 1, 16, 8, 8, 8192, 256, 128, 4),
-    "2": (128, 128, 4, 2, 1, 1024, 2, 32, 16, 16, 16384, 256, 256, 6),
-    "4": (256, 256, 2, 1, 0, 2048, 2, 64, 32, 32, 32768, 384, 256, 8),
-    "8": (512, 512, 1, 1, 0, 4096, 2, 128, 128, 64, 65536, 512, 384, 16),
+    "1/4": (16, 16, 16, 8, 0.3, 1, 256, 1.0, 4, 4, 2, 0.5, 1024, 32, 32, 2),
+    "1/2": (32, 32, 8, 4, 0.3, 1, 512, 1.5, 8, 8, 4, 0.4, 4096, 48, 48, 3),
+    "1": (64, 64, 8, 4, 0.15, 1, 1024, 2.0, 16, 8, 8, 0.3, 8192, 64, 64, 4),
+    "2": (128, 128, 4, 2, 0.15, 1, 1024, 3.0, 32, 16, 16, 0.25, 16384, 96, 64, 6),
+    "4": (256, 256, 2, 1, 0.0, 0, 2048, 3.0, 64, 32, 32, 0.2, 32768, 128, 128, 8),
+    "8": (512, 512, 1, 1, 0.0, 0, 4096, 4.0, 128, 128, 64, 0.15, 65536, 256, 256, 16),
 }
 CURVE = {name: dict(zip(_KNOBS, map(str, values), strict=True)) for name, values in _CURVE.items()}
 WARM_UP = {"volume.resolution": "32", "volume.coarse": "32", "gather.rays": "4", "patches.rays": "4"}

@@ -12,6 +12,7 @@ from warp_dvct.bench.__main__ import bench
 from warp_dvct.bench.references import Reference, combine
 from warp_dvct.bench.sweep import Indirect, SweepOptions, Truth, compare_indirect, parse_trials
 from warp_dvct.errors import OptionError
+from warp_dvct.settings import make_settings
 
 WIDTH, SPP = 64, 64
 
@@ -102,7 +103,8 @@ def test_curve_turns_every_knob_up():
         assert weaker.keys() == stronger.keys()
         for knob in weaker:
             a, b = float(weaker[knob]), float(stronger[knob])
-            assert a >= b if "stride" in knob or "smoothing" in knob else a <= b, knob
+            assert a >= b if any(word in knob for word in ("stride", "smoothing", "detail")) else a <= b, knob
+    assert make_settings("balanced", module.CURVE["1"]) == make_settings("balanced")
 
 
 def test_compare_prints_a_line_per_setting_and_writes_json(cache, tmp_path):
