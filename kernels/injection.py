@@ -11,16 +11,20 @@ NUDGE = wp.constant(0.3)  # voxels; a point on the wall between two voxels may r
 
 
 @wp.func
-def shown_area(area: wp.array(dtype=wp.vec2), record: int, normal: wp.vec3, solution: int) -> float:
+def shown_area(area: wp.array(dtype=wp.vec2), record: int, normal: wp.vec3, role: int) -> float:
+    """Area that real surfaces (role 0), or all, show of an orientation."""
     total = float(0.0)
     for face in range(6):
-        total += face_weight(normal, face) * area[record * 6 + face][solution]
+        total += face_weight(normal, face) * area[record * 6 + face][role]
     return total
 
 
 @wp.func
-def record_at(volume: Volume, area: wp.array(dtype=wp.vec2), position: wp.vec3, normal: wp.vec3, solution: int) -> int:
-    """The record that holds a surface point of that orientation, or -1."""
+def record_at(volume: Volume, area: wp.array(dtype=wp.vec2), position: wp.vec3, normal: wp.vec3, role: int) -> int:
+    """The record that holds a surface point of that orientation, or -1.
+
+    A real point needs a real surface: the outside of a floor is not to shine through what stands on its inside.
+    """
     local = (position - volume.low) / volume.voxel
     for attempt in range(3):
         p = local
@@ -30,7 +34,7 @@ def record_at(volume: Volume, area: wp.array(dtype=wp.vec2), position: wp.vec3, 
             p = local + normal * NUDGE
         record = find_record(volume, 0, int(wp.floor(p[0])), int(wp.floor(p[1])), int(wp.floor(p[2])))
         if record >= 0:
-            if shown_area(area, record, normal, solution) > 0.0:
+            if shown_area(area, record, normal, role) > 0.0:
                 return record
     return -1
 
@@ -57,7 +61,7 @@ def _find_targets(
     after = int(-1)
     before = int(-1)
     if role_after_in[i] >= 0:
-        after = record_at(volume, area_in, position_after_in[i], normal_after_in[i], 1)
+        after = record_at(volume, area_in, position_after_in[i], normal_after_in[i], role_after_in[i])
     if role_before_in[i] >= 0 and role_after_in[i] != 0:
         before = record_at(volume, area_in, position_before_in[i], normal_before_in[i], 0)
     key_out[i] = wp.where(after >= 0, after, EMPTY_KEY)

@@ -53,3 +53,15 @@ def test_indirect_light_does_not_depend_on_which_way_the_room_faces():
     ]
     np.testing.assert_array_equal(pictures[1], pictures[2])
     assert abs(pictures[1].mean() / pictures[0].mean() - 1.0) < 0.02
+
+
+def test_the_outside_of_a_closed_room_is_not_wanted(launcher):
+    """A sky lights the walls from outside, but what those reflect meets nothing."""
+    sky = Light(LightKind.DOME, (1.0, 1.0, 1.0), path="/Sky")
+    scene = replace(room(True), lights=(sky,))
+    assert np.all(DeviceScene.upload(launcher, scene, np.zeros(3), 1.0).double_sided[:12] == 0)
+    # A second room around it is lit by them.
+    around = box((-3, -3, -3), (5, 5, 5), Role.REAL, inward=True, path="/Around")
+    lamp = Light(LightKind.SPHERE, (20.0, 20.0, 20.0), position=(-2.0, 1.0, 1.0), radius=0.1, path="/Light")
+    nested = replace(scene, meshes=(*scene.meshes, around), lights=(lamp,))
+    assert np.all(DeviceScene.upload(launcher, nested, np.zeros(3), 1.0).double_sided[:12] == 1)
