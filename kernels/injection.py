@@ -15,7 +15,8 @@ def shown_area(area: wp.array(dtype=wp.vec2), record: int, normal: wp.vec3, role
     """Area that real surfaces (role 0), or all, show of an orientation."""
     total = float(0.0)
     for face in range(6):
-        total += face_weight(normal, face) * area[record * 6 + face][role]
+        shown = area[record * 6 + face]
+        total += face_weight(normal, face) * wp.where(role == 0, shown[0], shown[1])
     return total
 
 
