@@ -35,7 +35,8 @@ class DeviceScene:
         real, synthetic: The acceleration structures (``wp.Mesh``); None where there are no such triangles.
         triangles_vs: Host float32 ``[t, 3, 3]``, corners in volume space; real triangles first, then synthetic ones.
         role, material: Host int32 ``[t]``.
-        double_sided: Host int32 ``[t]``: 1 where the stage says so, or where light meets the mesh from behind.
+        double_sided: Host int32 ``[t]``: 1 where the stage says so, or where light meets the mesh from behind and goes
+            on to other surfaces.
         scanned: Host int32 ``[t]``: 1 where a triangle stands for a point of a cloud.
         origin: World position of volume space's origin, float64 ``[3]``, metres.
         scale: Volume-space units per metre.
@@ -173,7 +174,7 @@ def _build_mesh(launcher: Launcher, triangles: np.ndarray) -> Any:
 
 
 def _both_sides(launcher: Launcher, host: _HostTriangles, geometry: Any, materials: Any, lights: Any) -> np.ndarray:
-    """Per triangle, whether the back shows as well: a mesh that light meets from behind shows it everywhere."""
+    """Per triangle, whether the back shows as well: a mesh whose back passes light on shows it everywhere."""
     if not len(host.triangles) or np.all(host.double_sided != 0):
         return host.double_sided
     low, high = host.triangles.min((0, 1)), host.triangles.max((0, 1))

@@ -18,7 +18,8 @@ PROBE_BOUNCES = 4
 def lit_from_behind(
     launcher: Launcher, geometry: Any, materials: Any, lights: Any, center: np.ndarray, radius: float
 ) -> np.ndarray:
-    """Triangles that beams of any light, or their diffuse bounces, meet from behind: int indices, one per meeting.
+    """Triangles that beams of any light, or their diffuse bounces, meet from behind on their way to another surface:
+    int indices, one per meeting.
 
     USD's meshes are single sided unless they say otherwise, and many a room is modelled as a box that faces outwards.
 
