@@ -10,13 +10,11 @@ from warp_dvct.kernels.gbuffer import BACKGROUND, UNSEEN, Points, first_sample, 
 from warp_dvct.kernels.geometry import (
     FAR,
     Geometry,
-    Hit,
     occluded_by_real,
     occluded_by_synthetic,
     trace_real,
     trace_synthetic,
 )
-from warp_dvct.kernels.glossy_hits import FOCUSING
 from warp_dvct.kernels.lights import ADDED, DOME, Lights, light_along_ray, sample_light
 from warp_dvct.kernels.lobe_smoothing import Reflected
 from warp_dvct.kernels.materials import (
@@ -135,15 +133,6 @@ def shade_hit(
 
 
 @wp.func
-def focuses(geo: Geometry, mats: Materials, hit: Hit) -> bool:
-    """Whether the surface met has a lobe too narrow for its radiosity to stand for what it sends along a ray."""
-    m = geo.material[hit.triangle]
-    narrow = mats.roughness_texture[m] >= 0 or mats.roughness[m] * mats.roughness[m] <= FOCUSING
-    f0 = mats.f0[m]
-    return narrow and (mats.metallic[m] > 0.0 or wp.max(f0[0], wp.max(f0[1], f0[2])) > 0.0)
-
-
-@wp.func
 def reflected_along(
     geo: Geometry,
     mats: Materials,
@@ -155,6 +144,7 @@ def reflected_along(
     density: float,
     glossy: Glossy,
     blurred: bool,
+    focuses: wp.array(dtype=wp.int32),
     with_before: int,
     index: int,
     sample: int,
@@ -162,7 +152,7 @@ def reflected_along(
     """Radiance along a reflected ray, before and after, with the share of the lights that is the ray's.
 
     Surfaces met are shaded by the lights; for a ``blurred`` ray the voxels' radiosity stands for those that spread
-    their light.
+    their light, whose materials ``focuses`` does not mark.
     """
     result = Incident()
     real = trace_real(geo, origin, direction, FAR)
@@ -178,9 +168,9 @@ def reflected_along(
         result.before = result.before * INV_PI
         result.after = result.after * INV_PI
         if shade_real:
-            shade_real = focuses(geo, mats, real)
+            shade_real = focuses[geo.material[real.triangle]] != 0
         if shade_synthetic:
-            shade_synthetic = focuses(geo, mats, synthetic)
+            shade_synthetic = focuses[geo.material[synthetic.triangle]] != 0
     elif real.found == 0:
         result.before = environment_radiance(world.env, direction, 1.0 / rays, 0)
         result.after = environment_radiance(world.env, direction, 1.0 / rays, 1)
@@ -210,6 +200,7 @@ def _shade_specular_rays(
     bounces: BounceField,
     lights: Lights,
     glossy: Glossy,
+    focuses_in: wp.array(dtype=wp.int32),
     reflected_out: Reflected,
 ):
     """The GGX lobe's reflections by exact rays with visible-normal sampling (eq. 6's second term)."""
@@ -230,7 +221,20 @@ def _shade_specular_rays(
             origin = spawn_point(s, direction)
             blurred = s.alpha >= BLURRED
             light = reflected_along(
-                geo, mats, world, bounces, lights, origin, direction, density, glossy, blurred, 1 - s.synthetic, 0, k
+                geo,
+                mats,
+                world,
+                bounces,
+                lights,
+                origin,
+                direction,
+                density,
+                glossy,
+                blurred,
+                focuses_in,
+                1 - s.synthetic,
+                0,
+                k,
             )
             nearness += inverse_distance(light)
             after += wp.cw_mul(weight, light.after)

@@ -266,5 +266,5 @@ def _launch_slabs(command: Any, waiting: deque[int], slab: int, count: int) -> f
 def _another(command: Any) -> Any:
     """The same recorded launch for another thread: packing its arguments anew would hold Python's lock again."""
     other = copy.copy(command)
-    other.params, other.fwd_args = list(command.params), list(command.fwd_args)
+    other.params = list(command.params)
     return other

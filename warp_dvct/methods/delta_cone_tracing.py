@@ -26,6 +26,7 @@ from warp_dvct.passes.bounces import mean_albedo, reinject, solve_bounces
 from warp_dvct.passes.environment import build_environment
 from warp_dvct.passes.gather import (
     Gatherer,
+    focusing_materials,
     gather_all,
     gather_sparse,
     glossy_hits,
@@ -165,7 +166,7 @@ def render(
                     )
             if plan.glossy:
                 with launcher.scope("specular"):
-                    _shade_specular(launcher, device_scene, plan, light_field, buffer, part)
+                    _shade_specular(launcher, scene, device_scene, plan, light_field, buffer, part)
     with launcher.scope("resolve"):
         return resolve(
             launcher,
@@ -388,7 +389,13 @@ def _irradiance(
 
 
 def _shade_specular(
-    launcher: Launcher, scene: DeviceScene, plan: Plan, light_field: LightField, buffer: GBuffer, part: _Part
+    launcher: Launcher,
+    scene: Scene,
+    device_scene: DeviceScene,
+    plan: Plan,
+    light_field: LightField,
+    buffer: GBuffer,
+    part: _Part,
 ) -> None:
     settings = plan.settings
     rank, index, count = find_glossy(launcher, part.points, part.count, plan.alpha_max)
@@ -403,12 +410,13 @@ def _shade_specular(
     cone = _cone(plan) if settings.glossy == "cones" else None
     shade_specular(
         launcher,
-        scene,
+        device_scene,
         part.points,
         index,
         count,
         light_field.world,
         light_field.bounces,
+        launcher.array(focusing_materials(scene), wp.int32),
         glossy=glossy,
         cone=cone,
         light=part.light,

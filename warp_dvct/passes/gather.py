@@ -89,7 +89,7 @@ def glossy_hits(launcher: Launcher, scene: Scene, device_scene: DeviceScene, bou
     Args:
         bounces: ``BounceField``.
     """
-    focuses = np.array([_focuses(material) for material in scene.materials], np.int32)
+    focuses = focusing_materials(scene)
     if not focuses.any():
         return None
     hits = GlossyHits()
@@ -99,9 +99,14 @@ def glossy_hits(launcher: Launcher, scene: Scene, device_scene: DeviceScene, bou
     return hits
 
 
-def _focuses(material: Material) -> bool:
-    narrow = material.roughness_texture is not None or material.roughness**2 <= FOCUSING
-    return narrow and material.reflects
+def focusing_materials(scene: Scene) -> np.ndarray:
+    """Whether a lobe may be too narrow for radiosity to stand for what it sends: int32 ``[materials]``."""
+
+    def focuses(material: Material) -> bool:
+        narrow = material.roughness_texture is not None or material.roughness**2 <= FOCUSING
+        return narrow and material.reflects
+
+    return np.array([focuses(material) for material in scene.materials], np.int32)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ def shade_specular(
     count: int,
     world: Any,
     bounces: Any,
+    focuses: Any,
     *,
     glossy: Any,
     cone: Any,
@@ -41,13 +42,16 @@ def shade_specular(
 
     By exact visible-normal rays, whose hits are shaded by the lights themselves, or by one cone as wide as the lobe
     where ``cone`` is given.
+
+    Args:
+        focuses: int ``[materials]``, as ``kernels.glossy_hits.GlossyHits`` has it.
     """
     if cone is None:
         reflected = new_reflected(launcher, count)
         launcher.launch(
             kernels._shade_specular_rays,
             count,
-            [points, index, scene.geometry, scene.materials, world, bounces, scene.lights, glossy],
+            [points, index, scene.geometry, scene.materials, world, bounces, scene.lights, glossy, focuses],
             [reflected],
         )
         to = {"light": light, "before": before, "with_before": with_before}
