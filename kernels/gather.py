@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_dvct.kernels.aim import Sector, in_sector, sector_of_objects, sector_point
 from warp_dvct.kernels.cones import DUAL, OPAQUE, ConeSettings, march_cone
 from warp_dvct.kernels.environment import environment_radiance
 from warp_dvct.kernels.gbuffer import BACKGROUND, SYNTHETIC, UNSEEN, Points, first_sample, load_surface, share_of
@@ -22,7 +23,7 @@ from warp_dvct.kernels.materials import (
     spawn_point,
 )
 from warp_dvct.kernels.radiosity import Incident, World, radiosity_at
-from warp_dvct.kernels.sampling import INV_PI, PI, cosine_hemisphere, from_frame, sobol2, uniform1
+from warp_dvct.kernels.sampling import INV_PI, PI, concentric_disk, from_frame, sobol2, uniform1
 
 wp.set_module_options({"enable_backward": False})
 
@@ -140,6 +141,7 @@ class KeptRays:
 
     present: wp.int32  # 0: nothing is kept, the arrays are empty
     point: wp.array(dtype=wp.int32)  # [slots], -1 at first
+    count: wp.array(dtype=wp.int32)  # [slots], how many of its rays are kept
     reach: wp.array(dtype=wp.float32)  # [slots * rays], hit distance
     triangle: wp.array(dtype=wp.int32)  # [slots * rays], -1 where the ray meets nothing
 
@@ -161,10 +163,67 @@ def kept_real(kept: KeptRays, known: bool, at: int, geo: Geometry, origin: wp.ve
 
 
 @wp.struct
+class Rays:
+    """The rays of a gather point."""
+
+    count: wp.int32
+    even: wp.int32  # the first ones, cosine-distributed over the hemisphere; the others are aimed
+    first_even: wp.int32  # where their numbers in the picture's two sequences start
+    first_aimed: wp.int32
+    sector: Sector  # that the others are aimed at
+    known: wp.int32  # 1: the first ones are kept
+    slot: wp.int32  # of ``KeptRays``, where they are kept from on
+    seed: wp.int32
+
+
+@wp.func
+def rays_of(
+    points: Points,
+    j: int,
+    i: int,
+    s: Surface,
+    geo: Geometry,
+    rays: int,
+    aimed: float,
+    edge_samples: int,
+    stride: int,
+    seed: int,
+    kept: KeptRays,
+) -> Rays:
+    """The rays of point ``j``, kept in slot ``i``; ``aimed`` is the share of them that go towards synthetic objects."""
+    result = Rays()
+    result.seed = seed
+    result.even = share_of(rays, points, j, edge_samples)
+    few = int(float(result.even) * aimed)
+    result.sector = sector_of_objects(geo, s, few)
+    if result.sector.rays > 0:
+        result.even = few
+    result.count = result.even + result.sector.rays
+    parts = wp.where(points.slot[j] >= 0, edge_samples, 1)
+    result.first_even = first_sample(parts * result.even, result.even, stride, points, j)
+    result.first_aimed = first_sample(parts * result.sector.rays, result.sector.rays, stride, points, j)
+    result.slot = i * rays
+    if kept.present != 0:
+        # As many even rays as before are the same rays: their numbers start by how many there are.
+        if kept.point[i] == j and kept.count[i] == result.even:
+            result.known = 1
+    return result
+
+
+@wp.func
+def keep_known(kept: KeptRays, i: int, j: int, rays: Rays):
+    """Note which point's rays slot ``i`` holds now."""
+    if kept.present != 0:
+        kept.point[i] = j
+        kept.count[i] = rays.even
+
+
+@wp.struct
 class Ray:
     """A gathered ray and what it met; ``up`` is 0 where it would start below the surface."""
 
     up: wp.int32
+    weight: wp.float32  # in the mean of the point's rays
     origin: wp.vec3
     direction: wp.vec3
     solid_angle: wp.float32
@@ -173,18 +232,28 @@ class Ray:
 
 
 @wp.func
-def gathered_ray(
-    geo: Geometry, s: Surface, rays: int, seed: int, sample: int, kept: KeptRays, known: bool, at: int
-) -> Ray:
-    """Trace one of ``rays`` cosine-distributed rays."""
+def gathered_ray(geo: Geometry, s: Surface, rays: Rays, k: int, kept: KeptRays) -> Ray:
+    """Trace ray ``k`` of a point."""
     ray = Ray()
-    local = cosine_hemisphere(sobol2(seed, 0, sample, 11))
-    ray.direction = from_frame(local, s.normal)
-    ray.solid_angle = PI / (float(rays) * wp.max(local[2], 0.05))
+    disk = wp.vec2()
+    if k < rays.even:
+        disk = concentric_disk(sobol2(rays.seed, 0, rays.first_even + k, 11))
+    else:
+        disk = sector_point(rays.sector, sobol2(rays.seed, 0, rays.first_aimed + k - rays.even, 12))
+    density = float(rays.even)
+    if k >= rays.even or in_sector(rays.sector, disk):
+        density += float(rays.sector.rays) / rays.sector.share
+    ray.weight = 1.0 / density
+    height = wp.sqrt(wp.max(0.0, 1.0 - wp.length_sq(disk)))
+    ray.direction = from_frame(wp.vec3(disk[0], disk[1], height), s.normal)
+    ray.solid_angle = PI * ray.weight / wp.max(height, 0.05)
     if wp.dot(ray.direction, s.normal_g) > 0.0:
         ray.up = 1
         ray.origin = spawn_point(s, ray.direction)
-        ray.real = kept_real(kept, known, at, geo, ray.origin, ray.direction)
+        if k < rays.even:
+            ray.real = kept_real(kept, rays.known != 0, rays.slot + k, geo, ray.origin, ray.direction)
+        else:
+            ray.real = trace_real(geo, ray.origin, ray.direction, FAR)
         ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
     return ray
 
@@ -225,6 +294,7 @@ def _gather_rays(
     geo: Geometry,
     world: World,
     rays: int,
+    aimed: float,
     edge_samples: int,
     stride: int,
     seed: int,
@@ -233,38 +303,33 @@ def _gather_rays(
     after_out: wp.array(dtype=wp.vec3),
     nearness_out: wp.array(dtype=wp.float32),
 ):
-    """Irradiance [W m^-2] from indirect light and domes, by cosine-distributed exact rays (eq. 6's integral).
+    """Irradiance [W m^-2] from indirect light and domes, by exact rays (eq. 6's integral).
 
-    ``stride`` is the spacing of the gathered points in pixels; a pixel's ``edge_samples`` points share its rays out.
-    ``nearness_out`` is the mean inverse distance of what
-    the rays met.
+    They are cosine-distributed, and fewer but partly aimed at the synthetic objects where ``aimed`` is above 0 and
+    these take up little of the view (``kernels.aim``). ``stride`` is the spacing of the gathered points in pixels; a
+    pixel's ``edge_samples`` points share its rays out. ``nearness_out`` is the mean inverse distance of what the rays
+    met.
     """
     i = first + wp.tid()
     j = index_in[i]
-    share = int(rays)
     nearness = float(0.0)
     before = wp.vec3(0.0, 0.0, 0.0)
     after = wp.vec3(0.0, 0.0, 0.0)
     if j >= 0:
         if points.role[j] != BACKGROUND:
             s = load_surface(points, j)
-            known = False
-            if kept_out.present != 0:
-                known = kept_out.point[i] == j
-            share = share_of(rays, points, j, edge_samples)
-            start = first_sample(rays, share, stride, points, j)
-            for k in range(share):
-                ray = gathered_ray(geo, s, share, seed, start + k, kept_out, known, i * rays + k)
+            mine = rays_of(points, j, i, s, geo, rays, aimed, edge_samples, stride, seed, kept_out)
+            for k in range(mine.count):
+                ray = gathered_ray(geo, s, mine, k, kept_out)
                 if ray.up != 0:
                     light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
-                    before += light.before
-                    after += light.after
-                    nearness += inverse_distance(light)
-            if kept_out.present != 0:
-                kept_out.point[i] = j
-    before_out[i] = before / float(share)
-    after_out[i] = after / float(share)
-    nearness_out[i] = nearness / float(share)
+                    before += light.before * ray.weight
+                    after += light.after * ray.weight
+                    nearness += inverse_distance(light) * ray.weight
+            keep_known(kept_out, i, j, mine)
+    before_out[i] = before
+    after_out[i] = after
+    nearness_out[i] = nearness
 
 
 @wp.kernel
@@ -276,6 +341,7 @@ def _gather_rays_glossy(
     world: World,
     hits: GlossyHits,
     rays: int,
+    aimed: float,
     edge_samples: int,
     stride: int,
     seed: int,
@@ -287,31 +353,25 @@ def _gather_rays_glossy(
     """As ``_gather_rays``, where what rays meet may be glossy: apart, because it takes three times the registers."""
     i = first + wp.tid()
     j = index_in[i]
-    share = int(rays)
     nearness = float(0.0)
     before = wp.vec3(0.0, 0.0, 0.0)
     after = wp.vec3(0.0, 0.0, 0.0)
     if j >= 0:
         if points.role[j] != BACKGROUND:
             s = load_surface(points, j)
-            known = False
-            if kept_out.present != 0:
-                known = kept_out.point[i] == j
-            share = share_of(rays, points, j, edge_samples)
-            start = first_sample(rays, share, stride, points, j)
-            for k in range(share):
-                ray = gathered_ray(geo, s, share, seed, start + k, kept_out, known, i * rays + k)
+            mine = rays_of(points, j, i, s, geo, rays, aimed, edge_samples, stride, seed, kept_out)
+            for k in range(mine.count):
+                ray = gathered_ray(geo, s, mine, k, kept_out)
                 if ray.up != 0:
                     light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
-                    light = focused_incident(light, hits, geo, world, ray, start + k)
-                    before += light.before
-                    after += light.after
-                    nearness += inverse_distance(light)
-            if kept_out.present != 0:
-                kept_out.point[i] = j
-    before_out[i] = before / float(share)
-    after_out[i] = after / float(share)
-    nearness_out[i] = nearness / float(share)
+                    light = focused_incident(light, hits, geo, world, ray, mine.first_even + k)
+                    before += light.before * ray.weight
+                    after += light.after * ray.weight
+                    nearness += inverse_distance(light) * ray.weight
+            keep_known(kept_out, i, j, mine)
+    before_out[i] = before
+    after_out[i] = after
+    nearness_out[i] = nearness
 
 
 @wp.kernel

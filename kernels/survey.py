@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_dvct.kernels.aim import sector_of_objects
 from warp_dvct.kernels.gbuffer import BACKGROUND, Points, load_surface
 from warp_dvct.kernels.geometry import FAR, Geometry, trace_real, trace_synthetic
 from warp_dvct.kernels.materials import spawn_point
@@ -37,13 +38,16 @@ def _look_around(
     met_out: wp.array(dtype=wp.int32),
     entered_out: wp.array(dtype=wp.int32),
     nearness_out: wp.array(dtype=wp.float32),
+    aimed_out: wp.array(dtype=wp.int32),
 ):
     """Of a point's cosine-distributed rays, how many meet anything (-1 where there is no surface), how many pass the
-    synthetic objects' box before they meet something real, and the mean inverse distance of what they meet."""
+    synthetic objects' box before they meet something real, and the mean inverse distance of what they meet; and
+    whether the objects take up so little of its view that rays are aimed at them (1 or 0)."""
     i = first + wp.tid()
     j = index_in[i]
     entered_out[i] = 0
     nearness_out[i] = 0.0
+    aimed_out[i] = 0
     if points.role[j] == BACKGROUND:
         met_out[i] = -1
         return
@@ -64,3 +68,4 @@ def _look_around(
     met_out[i] = met
     entered_out[i] = entered
     nearness_out[i] = nearness / float(rays)
+    aimed_out[i] = sector_of_objects(geo, s, 1).rays

@@ -76,7 +76,7 @@ def test_counts_follow_their_settings(surveys):
 
     def counted(**changes):
         names = {k.replace("__", "."): v for k, v in changes.items()}
-        return count_work(make_settings("balanced", names), room, 320, 180)
+        return count_work(make_settings("balanced", {"gather.aimed": 0, **names}), room, 320, 180)
 
     base = counted(gather__rays=64, gather__object_rays=64, rsm__texels=64, volume__coarse=0, bounces=5)
     twice = counted(gather__rays=128, gather__object_rays=128, rsm__texels=64)["gather"]
@@ -96,6 +96,8 @@ def test_counts_follow_their_settings(surveys):
     without = count_work(make_settings(), replace(room, plate=False), 320, 180)
     assert without["gather"]["rays"] > counted()["gather"]["rays"]
     assert without["direct"]["before deep"] > 0 == base["direct"]["before deep"]
+    assert counted(gather__aimed=0.25)["gather"]["rays"] < counted(gather__aimed=0.5)["gather"]["rays"]
+    assert counted(gather__aimed=0.5)["gather"]["rays"] == pytest.approx(counted()["gather"]["rays"], rel=0.1)
 
 
 @pytest.fixture
@@ -119,11 +121,41 @@ def counted_gathers(monkeypatch) -> list[float]:
 def test_gathered_rays_are_those_of_a_frame(surveys, counted_gathers, stage, stride, detail):
     """Rays told from the survey against those that a frame of another size traces, halved strides included."""
     settings = {"gather.stride": stride, "gather.object_stride": stride // 2, "gather.detail": detail}
-    settings |= {"gather.rays": 4, "gather.object_rays": 4, "volume.resolution": 32, "volume.coarse": 32, "bounces": 4}
+    settings |= {
+        "gather.rays": 4,
+        "gather.object_rays": 4,
+        "gather.aimed": 0,
+        "volume.resolution": 32,
+        "volume.coarse": 32,
+        "bounces": 4,
+    }
     relighter = Relighter(path(stage), width=256, settings=settings)
     relighter.render(np.full((relighter.height, 256, 3), 0.5, np.float32))
     expected = count_work(relighter.settings, surveys[stage], 256, relighter.height)["gather"]["rays"]
     assert 1e6 * expected == pytest.approx(sum(counted_gathers), rel=0.3)
+
+
+@pytest.mark.parametrize("stage", ["room_area", "room_glossy", "ground_dome"])
+def test_aimed_points_are_those_of_a_frame(surveys, monkeypatch, stage):
+    """The share of real gather points whose rays are aimed, told from the survey, against a frame's kept rays."""
+    from warp_dvct.passes import gather
+
+    shares = []
+    run = gather.Gatherer.run
+
+    def watching(self, launcher, points, index, count, nearness=None, kept=None, **kwargs):
+        result = run(self, launcher, points, index, count, nearness, kept, **kwargs)
+        if kept is not None:
+            filled = kept.point.numpy() >= 0
+            shares.append(float((kept.count.numpy()[filled] < self.rays).mean()))
+        return result
+
+    monkeypatch.setattr(gather.Gatherer, "run", watching)
+    settings = {"gather.rays": 16, "gather.stride": 4, "volume.resolution": 32, "volume.coarse": 32, "bounces": 1}
+    relighter = Relighter(path(stage), width=256, settings=settings)
+    relighter.render(np.full((relighter.height, 256, 3), 0.5, np.float32))
+    assert [surveys[stage].on_real.aimed] == pytest.approx(shares, abs=0.03)
+    assert 0.2 < shares[0] < 1.0
 
 
 def test_voxels_and_patches_are_those_of_a_frame(surveys):

@@ -218,8 +218,8 @@ def _gather(settings: Settings, survey: Survey, width: int, height: int, edges: 
     """Rays of all gathered points, and what is done with them."""
     real, on_object = survey.on_real, survey.on_object
     first, again, objects = gathered_points(settings, survey, width, height)
-    counts = gathered(survey, real, first, settings.gather_rays)
-    _add(counts, gathered(survey, real, again, settings.gather_rays, entered=real.entered_again))
+    counts = _gathered_on_real(settings, survey, first, real.entered, real.aimed)
+    _add(counts, _gathered_on_real(settings, survey, again, real.entered_again, real.aimed_again))
     _add(counts, gathered(survey, on_object, objects, settings.gather_object_rays))
     pixels = width * height * 1e-6
     if not survey.plate:
@@ -228,6 +228,15 @@ def _gather(settings: Settings, survey: Survey, width: int, height: int, edges: 
         _add(counts, gathered(survey, real, hidden, max(1, settings.gather_rays // 4), entered=real.entered_again))
     blocks = pixels / settings.gather_stride**2 + pixels / settings.gather_object_stride**2
     return {"frame": 1, "points": pixels + edges, "blocks": blocks, **counts}
+
+
+def _gathered_on_real(settings: Settings, survey: Survey, points: float, entered: float, aimed: float) -> Counts:
+    """Of points whose share ``aimed`` sends fewer rays, and half of those into the objects' box."""
+    few = int(settings.gather_rays * settings.gather_aimed) if survey.plate else 0
+    far = points * aimed if few > 0 else 0.0
+    counts = gathered(survey, survey.on_real, points - far, settings.gather_rays, entered=entered)
+    _add(counts, gathered(survey, survey.on_real, far, 2 * few, entered=0.5 + 0.5 * entered))
+    return counts
 
 
 def gathered_points(settings: Settings, survey: Survey, width: int, height: int) -> tuple[float, float, float]:

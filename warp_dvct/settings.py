@@ -55,6 +55,13 @@ class Settings:
 
     gather: str = _knob("rays", "how diffuse indirect light is gathered", choices=("rays", "cones"))
     gather_rays: int = _knob(64, "rays per gather point on real surfaces", low=1, high=65536)
+    gather_aimed: float = _knob(
+        0.25,
+        "on a plate: share of a real gather point's rays that go towards the objects where these take up little of its"
+        " view, with as many over the hemisphere instead of all; 0 for never",
+        low=0.0,
+        high=1.0,
+    )
     gather_stride: int = _knob(8, "pixels between gather points on real surfaces; 1 for every pixel", low=1, high=64)
     gather_object_rays: int = _knob(64, "rays per gather point on synthetic surfaces", low=1, high=65536)
     gather_object_stride: int = _knob(4, "pixels between gather points on synthetic surfaces", low=1, high=64)

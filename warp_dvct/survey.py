@@ -101,12 +101,16 @@ class PointNeed:
         met: Share of their rays that meet a surface and do not leave the scene.
         entered, entered_again: Shares of their rays that pass the synthetic objects' box: of all points, and of those
             that are gathered again at half the stride.
+        aimed, aimed_again: Shares of the points, and of those again, of which the objects take up so little of the view
+            that rays are aimed at them.
     """
 
     need: GatherNeed
     met: float
     entered: float
     entered_again: float
+    aimed: float
+    aimed_again: float
 
 
 @dataclass(frozen=True)
@@ -342,7 +346,7 @@ def _look(
     lobed = (role >= 0) & (lobe[:, 0] > 0.0) & (lobe[:, 1] <= plan.alpha_max)
     sharp = lobed & (lobe[:, 1] < float(BLURRED))
     kinds = {"object": role == int(Role.SYNTHETIC), "sharp": sharp, "blurred": lobed & ~sharp}
-    met, entered, nearness = _around(scene, device_scene, launcher, plan, buffer)
+    met, entered, nearness, aimed = _around(scene, device_scene, launcher, plan, buffer)
     arrays = (points.pixel, points.position, points.normal, points.normal_g, points.footprint)
     shown = Seen(role, *(a.numpy() for a in arrays))
     changed = changed.repeat(2, 0).repeat(2, 1)
@@ -352,7 +356,11 @@ def _look(
         # Only real surfaces are left alone where nothing changes.
         live = changed if which == Role.REAL else np.ones_like(mask)
         need, again = gather_need.gather_need(View(shown, int(which), nearness, live))
-        needs[name] = PointNeed(need, _mean(met, mask), _mean(entered, mask), _mean(entered, again))
+        needs[name] = PointNeed(
+            need,
+            *(_mean(met, mask), _mean(entered, mask), _mean(entered, again)),
+            *(_mean(aimed, mask), _mean(aimed, again)),
+        )
     edges = EdgeNeed()
     if buffer.count > pixels:
         edges = EdgeNeed(**{name: float(kind[pixels : buffer.count].mean()) for name, kind in kinds.items()})
@@ -374,25 +382,24 @@ def _mean(values: np.ndarray, mask: np.ndarray) -> float:
 
 def _around(
     scene: Scene, device_scene: DeviceScene, launcher: Launcher, plan: Plan, buffer: GBuffer
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, ...]:
     """By pixel, from every other one each way: shares of its rays that meet a surface and that pass the synthetic box
-    (NaN where there is no surface), and the mean inverse distance of what they meet."""
+    (NaN where there is no surface), the mean inverse distance of what they meet, and whether any are aimed (1 or 0)."""
     shape = -(-buffer.height // 2), -(-buffer.width // 2)
     rows, columns = np.meshgrid(*(2 * np.arange(n) for n in shape), indexing="ij")
     index = launcher.array((rows * buffer.width + columns).ravel().astype(np.int32), wp.int32)
     count = index.shape[0]
     bounds = scene.bounds(Role.SYNTHETIC)
     low, high = ((b - np.asarray(plan.origin)) * plan.scale for b in bounds) if bounds else (np.ones(3), np.zeros(3))
-    met, entered = launcher.empty(count, wp.int32), launcher.empty(count, wp.int32)
+    met, entered, aimed = (launcher.empty(count, wp.int32) for _ in range(3))
     nearness = launcher.empty(count, wp.float32)
     inputs = [buffer.points, index, device_scene.geometry, wp.vec3(*low), wp.vec3(*high), RAYS, 0]
-    launcher.launch(kernels._look_around, count, inputs, [met, entered, nearness])
+    launcher.launch(kernels._look_around, count, inputs, [met, entered, nearness, aimed])
     found = met.numpy().astype(np.float64)
     missing = found < 0
-    shares = (found / RAYS, entered.numpy() / RAYS, nearness.numpy().astype(np.float64))
+    shares = (found / RAYS, entered.numpy() / RAYS, nearness.numpy().astype(np.float64), aimed.numpy().astype(float))
     full = [np.where(missing, np.nan if k < 2 else 0.0, a).reshape(shape) for k, a in enumerate(shares)]
-    met_all, entered_all, near_all = (a.repeat(2, 0).repeat(2, 1)[: buffer.height, : buffer.width] for a in full)
-    return met_all, entered_all, near_all
+    return tuple(a.repeat(2, 0).repeat(2, 1)[: buffer.height, : buffer.width] for a in full)
 
 
 def _near(scene: Scene, plan: Plan, buffer: GBuffer, real: np.ndarray) -> float:

@@ -8,8 +8,18 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_dvct.bench.twins.aim import Sectors
 from warp_dvct.bench.twins.deviation import Deviation, compare
-from warp_dvct.bench.twins.numbers import cosine_hemisphere, dot, from_frame, hash2, sobol2, uint, unit_float
+from warp_dvct.bench.twins.numbers import (
+    concentric_disk,
+    cosine_hemisphere,
+    dot,
+    from_frame,
+    hash2,
+    sobol2,
+    uint,
+    unit_float,
+)
 from warp_dvct.bench.twins.stage import Twin
 from warp_dvct.bench.twins.volumes import N, fields, lit
 from warp_dvct.kernels import bounces, cones, gather, reconstruction, specular
@@ -177,19 +187,38 @@ def radiosity(field: np.ndarray, place: np.ndarray, normal: np.ndarray, footprin
 
 
 def measure_rays(launcher: Any) -> list[Deviation]:
-    """Cosine-distributed rays that read the voxels they hit, before and after."""
+    """Rays that read the voxels they hit, before and after: cosine-distributed, and partly aimed at the objects."""
+    return _gathered(launcher, 0.0, "") + _gathered(launcher, 0.25, ", aimed")
+
+
+def _gathered(launcher: Any, aimed: float, what: str) -> list[Deviation]:
     twin, voxels, _, _ = lit(launcher)
     points, position, normal, triangle = places(launcher, twin)
-    gatherer = Gatherer(twin.device, world_of(launcher, twin, voxels.volume), RAYS, 0)
+    gatherer = Gatherer(twin.device, world_of(launcher, twin, voxels.volume), RAYS, 0, aimed=aimed)
     index = launcher.array(np.arange(COUNT, dtype=np.int32), wp.int32)
     got = gatherer.run(launcher, points, index, COUNT)
 
     field = fields(voxels)[0]
+    sectors = Sectors.of(twin, position, normal)
+    few = round(RAYS * aimed)
+    plain = ~sectors.aimed | (few == 0)
     total = np.zeros((COUNT, 2, 3))
     for k in range(RAYS):
-        total += incident(GatherRay.trace(twin, position, normal, triangle, k), field) / RAYS
+        disk = np.broadcast_to(concentric_disk(sobol2(0, 0, k, 11)), (COUNT, 2))
+        total += weighted(twin, (position, normal, triangle), disk, plain / RAYS, field)
+    for k in range(few):
+        for disk in (concentric_disk(sobol2(0, 0, k, 11)) + np.zeros((COUNT, 1)), sectors.point(sobol2(0, 0, k, 12))):
+            density = few * (1.0 + sectors.contain(disk) / sectors.share)
+            total += weighted(twin, (position, normal, triangle), disk, ~plain / density, field)
     kernel = gather._gather_rays
-    return [compare(kernel, name, got[s].numpy(), total[:, s]) for s, name in enumerate(("before", "after"))]
+    return [compare(kernel, name + what, got[s].numpy(), total[:, s]) for s, name in enumerate(("before", "after"))]
+
+
+def weighted(twin: Twin, surfaces: Any, disk: np.ndarray, weight: np.ndarray, field: np.ndarray) -> np.ndarray:
+    """What one ray of each point adds to its irradiance: ``[n, solution, 3]``."""
+    position, normal, triangle = surfaces
+    ray = GatherRay.along(twin, position, normal, triangle, disk, weight)
+    return weight[:, None, None] * incident(ray, field)
 
 
 @dataclass(frozen=True)
@@ -206,10 +235,24 @@ class GatherRay:
     @staticmethod
     def trace(twin: Twin, position: np.ndarray, normal: np.ndarray, triangle: np.ndarray, k: int) -> GatherRay:
         """Ray ``k`` of the picture's sequence, cosine-distributed."""
-        local = np.broadcast_to(cosine_hemisphere(sobol2(0, 0, k, 11)), position.shape)
-        origin, direction = twin.spawn(position, triangle, normal), from_frame(local, normal)
+        disk = np.broadcast_to(concentric_disk(sobol2(0, 0, k, 11)), (len(position), 2))
+        return GatherRay.along(twin, position, normal, triangle, disk, np.full(len(position), 1.0 / RAYS))
+
+    @staticmethod
+    def along(
+        twin: Twin,
+        position: np.ndarray,
+        normal: np.ndarray,
+        triangle: np.ndarray,
+        disk: np.ndarray,
+        weight: np.ndarray,
+    ) -> GatherRay:
+        """The ray over a point of the disk below the hemisphere, which stands for a share ``weight`` of the disk."""
+        height = np.sqrt(np.maximum(1.0 - (disk**2).sum(-1), 0.0))
+        direction = from_frame(np.concatenate([disk, height[:, None]], 1), normal)
+        origin = twin.spawn(position, triangle, normal)
         met = (twin.nearest(origin, direction, part) for part in (twin.real, twin.synthetic))
-        return GatherRay(twin, origin, direction, np.pi / (RAYS * np.maximum(local[:, 2], 0.05)), *met)
+        return GatherRay(twin, origin, direction, np.pi * weight / np.maximum(height, 0.05), *met)
 
     @property
     def blocked(self) -> np.ndarray:

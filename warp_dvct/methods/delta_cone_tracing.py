@@ -366,7 +366,8 @@ def _irradiance(
     if settings.gather == "cones":
         cone = _cone(plan, math.radians(settings.cones_aperture))
     shared = settings.seed, settings.cones_count, cone, part.with_before, hits, max(1, settings.antialias)
-    real = Gatherer(scene, world, settings.gather_rays, *shared)
+    aimed = 0.0 if part.with_before else settings.gather_aimed
+    real = Gatherer(scene, world, settings.gather_rays, *shared, aimed)
     if part.points is not buffer.points:
         fewer = Gatherer(scene, world, max(1, settings.gather_rays // 4), *shared)
         return gather_all(launcher, part.points, part.count, fewer)

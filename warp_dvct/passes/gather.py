@@ -26,7 +26,8 @@ class Gatherer:
     """How irradiance is gathered at a list of points: exact rays, or cones where ``cone`` is given.
 
     ``hits``: ``GlossyHits`` (:func:`glossy_hits`), for rays; None where surfaces met are taken as Lambertian.
-    ``edge_samples``: Points of an edge pixel, which share its rays out.
+    ``edge_samples``: Points of an edge pixel, which share its rays out. ``aimed``: Share of a point's rays that go
+    towards synthetic objects, where these take up little of its view; for points on real surfaces.
     """
 
     scene: DeviceScene
@@ -38,6 +39,7 @@ class Gatherer:
     with_before: bool = True
     hits: Any = None
     edge_samples: int = 1
+    aimed: float = 0.0
 
     def run(
         self,
@@ -65,7 +67,7 @@ class Gatherer:
             how = [self.cones, self.cone, int(self.with_before), self.seed]
             launcher.launch(kernels._gather_cones, count, [*shared, *how], [before, after])
             return before, after
-        how = [self.rays, self.edge_samples, stride, self.seed, kept or keep_rays(launcher, 0, 0)]
+        how = [self.rays, self.aimed, self.edge_samples, stride, self.seed, kept or keep_rays(launcher, 0, 0)]
         if self.hits is None:
             launcher.launch(kernels._gather_rays, count, [*shared, *how], [before, after, nearness])
         else:
@@ -78,6 +80,7 @@ def keep_rays(launcher: Launcher, slots: int, rays: int) -> Any:
     kept = kernels.KeptRays()
     kept.present = int(slots > 0)
     kept.point = launcher.full(max(1, slots), -1, wp.int32)
+    kept.count = launcher.zeros(max(1, slots), wp.int32)
     kept.reach = launcher.empty(max(1, slots * rays), wp.float32)
     kept.triangle = launcher.empty(max(1, slots * rays), wp.int32)
     return kept

@@ -1,0 +1,58 @@
+"""Twin of aimed rays: the part of the disk that objects take up, and each ray's weight in the mean of a point's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from warp_dvct.bench.twins.numbers import dot, from_frame
+from warp_dvct.bench.twins.stage import Twin
+from warp_dvct.kernels.aim import NARROWEST, ROUND, WIDEST
+
+
+@dataclass(frozen=True)
+class Sectors:
+    """By point: the middle azimuth and half the width [rad], squared radii, and the share of the disk; ``aimed`` says
+    whether rays go there."""
+
+    aimed: np.ndarray
+    middle: np.ndarray
+    half: np.ndarray
+    inner: np.ndarray
+    outer: np.ndarray
+    share: np.ndarray
+
+    @staticmethod
+    def of(twin: Twin, position: np.ndarray, normal: np.ndarray) -> Sectors:
+        """Of the box around the synthetic objects."""
+        geometry = twin.device.geometry
+        center, extent = (np.array([*v], float) for v in (geometry.center, geometry.extent))
+        axes = [from_frame(np.broadcast_to(e, normal.shape), normal) for e in np.eye(3)]
+        corners = center + np.array(list(product((-1.0, 1.0), repeat=3))) * extent
+        x, y, height = (dot((corners[:, None] - position), axis) for axis in axes)  # [corner, n]
+        start = np.arctan2(dot(center - position, axes[1]), dot(center - position, axes[0]))
+        turn = (np.arctan2(y, x) - start + np.pi) % (2 * np.pi) - np.pi
+        left, right = np.minimum(turn.min(0), 0.0), np.maximum(turn.max(0), 0.0)
+        around = right - left >= float(ROUND)
+        half = np.where(around, np.pi, np.maximum(0.5 * (right - left), float(NARROWEST)))
+        square, high, low = x * x + y * y, height.max(0), np.maximum(height.min(0), 0.0)
+        outer = square.max(0) / (square.max(0) + low**2)
+        near = square.min(0) * np.cos(half) ** 2
+        inner = np.where(around, 0.0, np.minimum(near / (near + high**2), outer - float(NARROWEST)))
+        share = (outer - inner) * half / np.pi
+        aimed = (high > 0.0) & (share < float(WIDEST))
+        return Sectors(aimed, start + 0.5 * (left + right) * ~around, half, inner, outer, share)
+
+    def contain(self, disk: np.ndarray) -> np.ndarray:
+        """Whether a point of the disk lies in each."""
+        square = (disk**2).sum(-1)
+        away = np.abs((np.arctan2(disk[..., 1], disk[..., 0]) - self.middle + np.pi) % (2 * np.pi) - np.pi)
+        return (square >= self.inner) & (square <= self.outer) & (away <= self.half)
+
+    def point(self, xi: np.ndarray) -> np.ndarray:
+        """A uniformly distributed point of each."""
+        radius = np.sqrt(self.inner + (self.outer - self.inner) * xi[..., 0])
+        turn = self.middle + self.half * (2.0 * xi[..., 1] - 1.0)
+        return np.stack([radius * np.cos(turn), radius * np.sin(turn)], -1)
