@@ -28,6 +28,10 @@ TABLES = {
         "`gather.smoothing=2`: gather.smoothing=2",
         "`gather.rays=16`, objects too: gather.rays=16 gather.object_rays=16",
         "`gather.rays=256`, objects too: gather.rays=256 gather.object_rays=256",
+        "`gather.aimed=0`: gather.aimed=0",
+        "`gather.aimed=0`, 32 rays: gather.aimed=0 gather.rays=32",
+        "`gather.aimed=0.25`: gather.aimed=0.25",
+        "`gather.aimed=1`: gather.aimed=1",
         "`gather.detail=0`: gather.detail=0",
         "strides of 2 and 1: gather.stride=2 gather.object_stride=1",
         "strides of 4 and 2: gather.stride=4 gather.object_stride=2",
@@ -51,6 +55,7 @@ TABLES = {
     ],
     "edges and lobes": [
         "`antialias=0`: antialias=0",
+        "`antialias=4`: antialias=4",
         "`antialias=16`: antialias=16",
         "`glossy.rays=2`: glossy.rays=2",
         "`glossy.rays=32`: glossy.rays=32",

@@ -36,7 +36,7 @@ REFERENCE = {
     "bounces": 8,
     "patches.count": 8192,
     "patches.rays": 64,
-    "antialias": 4,
+    "antialias": 8,
     "glossy.rays": 8,
 }
 CLOSED = 0.8  # share of gathered rays that meet a surface: above it a scene counts as a closed room

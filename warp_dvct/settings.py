@@ -28,7 +28,7 @@ class Settings:
 
     seed: int = _knob(0, "seed of every random number", low=0, high=2**31 - 1)
     bounces: int = _knob(6, "indirect bounces: 0 direct light only, 1 the paper's single bounce", low=0, high=64)
-    antialias: int = _knob(4, "shading points per edge pixel; 0 for none", low=0, high=64)
+    antialias: int = _knob(8, "shading points per edge pixel; 0 for none", low=0, high=64)
 
     # Rays see no difference between these and the paper's 256: what shows is how many texels light a voxel.
     volume_resolution: int = _knob(64, "voxels an edge of the fine volume", low=1, high=1024)
@@ -56,7 +56,7 @@ class Settings:
     gather: str = _knob("rays", "how diffuse indirect light is gathered", choices=("rays", "cones"))
     gather_rays: int = _knob(64, "rays per gather point on real surfaces", low=1, high=65536)
     gather_aimed: float = _knob(
-        0.25,
+        0.375,
         "on a plate: share of a real gather point's rays that go towards the objects where these take up little of its"
         " view, with as many over the hemisphere instead of all; 0 for never",
         low=0.0,
@@ -160,7 +160,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "bounces": 12,
         "volume.resolution": 96,
         "rsm.density": 3,
-        "antialias": 8,
         "shadows.samples": 32,
         "shadows.probes": 16,
         "rsm.texels": 1024,

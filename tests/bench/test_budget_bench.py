@@ -189,4 +189,4 @@ def test_the_command_writes_a_table(tmp_path):
     words = ["error-table", str(tmp_path / "rows.jsonl"), "--out", str(out)]
     result = CliRunner().invoke(bench, words, catch_exceptions=False)
     assert "2 points; predicted within a factor of 1.5: 2" in result.output
-    assert json.loads(out.read_text())["knobs"]["diffuse"]["antialias"] == [[0.0, 1.25], [4.0, 0.0]]
+    assert json.loads(out.read_text())["knobs"]["diffuse"]["antialias"] == [[0.0, 1.25], [8.0, 0.0]]
