@@ -189,7 +189,7 @@ def test_edge_points_share_their_pixel_s_samples(surveys):
     )
     assert many == pytest.approx(few)
     assert room.outline * 320 > 1000
-    specular = count_work(make_settings("balanced", {"glossy.rays": 16}), glossy, 320, 180)["specular"]
+    specular = count_work(make_settings("balanced", {"glossy.rays": 16, "antialias": 4}), glossy, 320, 180)["specular"]
     assert specular["blurred"] == 0.0
     assert specular["sharp"] == pytest.approx(16 * specular["points"], rel=0.3)
 

@@ -218,8 +218,8 @@ def _gather(settings: Settings, survey: Survey, width: int, height: int, edges: 
     """Rays of all gathered points, and what is done with them."""
     real, on_object = survey.on_real, survey.on_object
     first, again, objects = gathered_points(settings, survey, width, height)
-    counts = _gathered_on_real(settings, survey, first, real.entered, real.aimed)
-    _add(counts, _gathered_on_real(settings, survey, again, real.entered_again, real.aimed_again))
+    counts = gathered_on_real(settings, survey, first, real.entered, real.aimed)
+    _add(counts, gathered_on_real(settings, survey, again, real.entered_again, real.aimed_again))
     _add(counts, gathered(survey, on_object, objects, settings.gather_object_rays))
     pixels = width * height * 1e-6
     if not survey.plate:
@@ -230,8 +230,9 @@ def _gather(settings: Settings, survey: Survey, width: int, height: int, edges: 
     return {"frame": 1, "points": pixels + edges, "blocks": blocks, **counts}
 
 
-def _gathered_on_real(settings: Settings, survey: Survey, points: float, entered: float, aimed: float) -> Counts:
-    """Of points whose share ``aimed`` sends fewer rays, and half of those into the objects' box."""
+def gathered_on_real(settings: Settings, survey: Survey, points: float, entered: float, aimed: float) -> Counts:
+    """As :func:`gathered`, of points on real surfaces whose share ``aimed`` sends fewer rays, half of them into the
+    objects' box."""
     few = int(settings.gather_rays * settings.gather_aimed) if survey.plate else 0
     far = points * aimed if few > 0 else 0.0
     counts = gathered(survey, survey.on_real, points - far, settings.gather_rays, entered=entered)

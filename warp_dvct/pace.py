@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warp_dvct.cost import REST, Counts, gathered, gathered_points, price
+from warp_dvct.cost import REST, Counts, gathered, gathered_on_real, gathered_points, price
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import probe
 from warp_dvct.launch import Launcher
@@ -178,17 +178,19 @@ class Pace:
         found = [np.flatnonzero(role == int(r)) for r in (Role.REAL, Role.SYNTHETIC)]
         first, again, objects = gathered_points(settings, self.survey, self.width, self.height)
         share = objects / max(first + again + objects, 1.0)
-        one = self._trial_seconds(1.0 - share, share, rays)
+        few = with_rays(settings, rays)
+        one = self._trial_seconds(few, 1.0 - share, share)
         wanted = launcher.threads * max(LEAST_TRIAL, TRIAL_SHARE * left / TRIALS) / max(one, 1e-9)
         points = int(np.clip(wanted, LEAST_POINTS, len(role)))
         hits = glossy_hits(launcher, scene, device_scene, lit.bounces, settings.seed)
-        gatherer = Gatherer(device_scene, lit.world, rays, settings.seed, hits=hits)
+        aimed = settings.gather_aimed if self.survey.plate else 0.0
+        gatherer = Gatherer(device_scene, lit.world, rays, settings.seed, hits=hits, aimed=aimed)
         numbers = round((1.0 - share) * points), round(share * points)
         ratios = []
         for k in range(TRIALS):
             chosen = [_spread(pixels, n, k) for pixels, n in zip(found, numbers, strict=True)]
             index = launcher.array(np.concatenate(chosen).astype(np.int32), wp.int32)
-            predicted = self._trial_seconds(len(chosen[0]), len(chosen[1]), rays)
+            predicted = self._trial_seconds(few, len(chosen[0]), len(chosen[1]))
             now = time.perf_counter if launcher.device.is_cuda else time.process_time
             start = now()
             gatherer.run(launcher, buffer.points, index, index.shape[0], stride=settings.gather_stride)
@@ -196,10 +198,14 @@ class Pace:
             ratios.append((now() - start) / predicted)
         return float(np.median(ratios))
 
-    def _trial_seconds(self, real: float, objects: float, rays: int) -> float:
-        """Predicted processor time of rays from some points on real surfaces and on objects."""
-        wheres = (self.survey.on_real, real), (self.survey.on_object, objects)
-        return sum(price({"gather": gathered(self.survey, w, n, rays)}, self.cpu_units) for w, n in wheres)
+    def _trial_seconds(self, settings: Settings, real: float, objects: float) -> float:
+        """Predicted processor time of the rays of some points on real surfaces and on objects."""
+        on_real, on_object = self.survey.on_real, self.survey.on_object
+        counts = [
+            gathered_on_real(settings, self.survey, real, on_real.entered, on_real.aimed),
+            gathered(self.survey, on_object, objects, settings.gather_object_rays),
+        ]
+        return sum(price({"gather": each}, self.cpu_units) for each in counts)
 
 
 def _spread(pixels: np.ndarray, count: int, trial: int) -> np.ndarray:
