@@ -26,9 +26,11 @@ class Sector:
     rays: wp.int32  # 0: none, and nothing else counts
     middle: wp.vec2  # unit vector towards the middle
     half: wp.float32  # half the angle at the disk's centre
+    sine: wp.float32  # of that
     inner: wp.float32  # squares of the radii between which it lies
     outer: wp.float32
     share: wp.float32  # of the disk's area
+    weight: wp.float32  # of a ray within in the mean of all, where as many as go here are spread over the disk
 
 
 @wp.func
@@ -80,6 +82,8 @@ def sector_of_objects(geo: Geometry, s: Surface, rays: int) -> Sector:
     sector.share = (sector.outer - sector.inner) * sector.half / PI
     if sector.share < WIDEST:
         sector.rays = rays
+        sector.sine = wp.sin(sector.half)
+        sector.weight = 1.0 / (float(rays) * (1.0 + 1.0 / sector.share))
     return sector
 
 
@@ -92,7 +96,15 @@ def in_sector(sector: Sector, disk: wp.vec2) -> bool:
     if sector.half >= PI:
         return True
     across = sector.middle[0] * disk[1] - sector.middle[1] * disk[0]
-    return wp.dot(disk, sector.middle) > 0.0 and wp.abs(across) <= wp.sqrt(square) * wp.sin(sector.half)
+    return wp.dot(disk, sector.middle) > 0.0 and wp.abs(across) <= wp.sqrt(square) * sector.sine
+
+
+@wp.func
+def ray_weight(sector: Sector, even: int, disk: wp.vec2) -> float:
+    """Of one of ``even`` rays spread over the disk, beside as many in the sector: the balance heuristic."""
+    if in_sector(sector, disk):
+        return sector.weight
+    return 1.0 / float(even)
 
 
 @wp.func

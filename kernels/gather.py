@@ -2,10 +2,19 @@
 
 import warp as wp
 
-from warp_dvct.kernels.aim import Sector, in_sector, sector_of_objects, sector_point
+from warp_dvct.kernels.aim import ray_weight, sector_of_objects, sector_point
 from warp_dvct.kernels.cones import DUAL, OPAQUE, ConeSettings, march_cone
 from warp_dvct.kernels.environment import environment_radiance
-from warp_dvct.kernels.gbuffer import BACKGROUND, SYNTHETIC, UNSEEN, Points, first_sample, load_surface, share_of
+from warp_dvct.kernels.gbuffer import (
+    BACKGROUND,
+    SYNTHETIC,
+    UNSEEN,
+    Points,
+    first_sample,
+    load_surface,
+    pixel_points,
+    share_of,
+)
 from warp_dvct.kernels.geometry import (
     FAR,
     Geometry,
@@ -163,67 +172,10 @@ def kept_real(kept: KeptRays, known: bool, at: int, geo: Geometry, origin: wp.ve
 
 
 @wp.struct
-class Rays:
-    """The rays of a gather point."""
-
-    count: wp.int32
-    even: wp.int32  # the first ones, cosine-distributed over the hemisphere; the others are aimed
-    first_even: wp.int32  # where their numbers in the picture's two sequences start
-    first_aimed: wp.int32
-    sector: Sector  # that the others are aimed at
-    known: wp.int32  # 1: the first ones are kept
-    slot: wp.int32  # of ``KeptRays``, where they are kept from on
-    seed: wp.int32
-
-
-@wp.func
-def rays_of(
-    points: Points,
-    j: int,
-    i: int,
-    s: Surface,
-    geo: Geometry,
-    rays: int,
-    aimed: float,
-    edge_samples: int,
-    stride: int,
-    seed: int,
-    kept: KeptRays,
-) -> Rays:
-    """The rays of point ``j``, kept in slot ``i``; ``aimed`` is the share of them that go towards synthetic objects."""
-    result = Rays()
-    result.seed = seed
-    result.even = share_of(rays, points, j, edge_samples)
-    few = int(float(result.even) * aimed)
-    result.sector = sector_of_objects(geo, s, few)
-    if result.sector.rays > 0:
-        result.even = few
-    result.count = result.even + result.sector.rays
-    parts = wp.where(points.slot[j] >= 0, edge_samples, 1)
-    result.first_even = first_sample(parts * result.even, result.even, stride, points, j)
-    result.first_aimed = first_sample(parts * result.sector.rays, result.sector.rays, stride, points, j)
-    result.slot = i * rays
-    if kept.present != 0:
-        # As many even rays as before are the same rays: their numbers start by how many there are.
-        if kept.point[i] == j and kept.count[i] == result.even:
-            result.known = 1
-    return result
-
-
-@wp.func
-def keep_known(kept: KeptRays, i: int, j: int, rays: Rays):
-    """Note which point's rays slot ``i`` holds now."""
-    if kept.present != 0:
-        kept.point[i] = j
-        kept.count[i] = rays.even
-
-
-@wp.struct
 class Ray:
     """A gathered ray and what it met; ``up`` is 0 where it would start below the surface."""
 
     up: wp.int32
-    weight: wp.float32  # in the mean of the point's rays
     origin: wp.vec3
     direction: wp.vec3
     solid_angle: wp.float32
@@ -232,30 +184,33 @@ class Ray:
 
 
 @wp.func
-def gathered_ray(geo: Geometry, s: Surface, rays: Rays, k: int, kept: KeptRays) -> Ray:
-    """Trace ray ``k`` of a point."""
+def ray_over(s: Surface, disk: wp.vec2, weight: float) -> Ray:
+    """The ray over a point of the disk under the hemisphere, which stands for a share ``weight`` of the disk."""
     ray = Ray()
-    disk = wp.vec2()
-    if k < rays.even:
-        disk = concentric_disk(sobol2(rays.seed, 0, rays.first_even + k, 11))
-    else:
-        disk = sector_point(rays.sector, sobol2(rays.seed, 0, rays.first_aimed + k - rays.even, 12))
-    density = float(rays.even)
-    if k >= rays.even or in_sector(rays.sector, disk):
-        density += float(rays.sector.rays) / rays.sector.share
-    ray.weight = 1.0 / density
     height = wp.sqrt(wp.max(0.0, 1.0 - wp.length_sq(disk)))
     ray.direction = from_frame(wp.vec3(disk[0], disk[1], height), s.normal)
-    ray.solid_angle = PI * ray.weight / wp.max(height, 0.05)
+    ray.solid_angle = PI * weight / wp.max(height, 0.05)
     if wp.dot(ray.direction, s.normal_g) > 0.0:
         ray.up = 1
         ray.origin = spawn_point(s, ray.direction)
-        if k < rays.even:
-            ray.real = kept_real(kept, rays.known != 0, rays.slot + k, geo, ray.origin, ray.direction)
-        else:
-            ray.real = trace_real(geo, ray.origin, ray.direction, FAR)
-        ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
     return ray
+
+
+@wp.struct
+class Gathered:
+    """Means over a point's rays."""
+
+    before: wp.vec3
+    after: wp.vec3
+    nearness: wp.float32
+
+
+@wp.func
+def add_light(total: Gathered, light: Incident, weight: float) -> Gathered:
+    total.before += light.before * weight
+    total.after += light.after * weight
+    total.nearness += weight * inverse_distance(light)
+    return total
 
 
 @wp.func
@@ -312,24 +267,40 @@ def _gather_rays(
     """
     i = first + wp.tid()
     j = index_in[i]
-    nearness = float(0.0)
-    before = wp.vec3(0.0, 0.0, 0.0)
-    after = wp.vec3(0.0, 0.0, 0.0)
+    total = Gathered()
     if j >= 0:
         if points.role[j] != BACKGROUND:
             s = load_surface(points, j)
-            mine = rays_of(points, j, i, s, geo, rays, aimed, edge_samples, stride, seed, kept_out)
-            for k in range(mine.count):
-                ray = gathered_ray(geo, s, mine, k, kept_out)
+            even = share_of(rays, points, j, edge_samples)
+            sector = sector_of_objects(geo, s, int(float(even) * aimed))
+            if sector.rays > 0:
+                even = sector.rays
+            known = False
+            if kept_out.present != 0:
+                # As many even rays as before are the same rays: their numbers start by how many there are.
+                known = kept_out.point[i] == j and kept_out.count[i] == even
+                kept_out.point[i] = j
+                kept_out.count[i] = even
+            start = first_sample(even * pixel_points(points, j, edge_samples), even, stride, points, j)
+            for k in range(even):
+                disk = concentric_disk(sobol2(seed, 0, start + k, 11))
+                weight = ray_weight(sector, even, disk)
+                ray = ray_over(s, disk, weight)
                 if ray.up != 0:
+                    ray.real = kept_real(kept_out, known, i * rays + k, geo, ray.origin, ray.direction)
+                    ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
                     light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
-                    before += light.before * ray.weight
-                    after += light.after * ray.weight
-                    nearness += inverse_distance(light) * ray.weight
-            keep_known(kept_out, i, j, mine)
-    before_out[i] = before
-    after_out[i] = after
-    nearness_out[i] = nearness
+                    total = add_light(total, light, weight)
+            for k in range(sector.rays):
+                ray = ray_over(s, sector_point(sector, sobol2(seed, 0, start + k, 12)), sector.weight)
+                if ray.up != 0:
+                    ray.real = trace_real(geo, ray.origin, ray.direction, FAR)
+                    ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
+                    light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
+                    total = add_light(total, light, sector.weight)
+    before_out[i] = total.before
+    after_out[i] = total.after
+    nearness_out[i] = total.nearness
 
 
 @wp.kernel
@@ -353,25 +324,42 @@ def _gather_rays_glossy(
     """As ``_gather_rays``, where what rays meet may be glossy: apart, because it takes three times the registers."""
     i = first + wp.tid()
     j = index_in[i]
-    nearness = float(0.0)
-    before = wp.vec3(0.0, 0.0, 0.0)
-    after = wp.vec3(0.0, 0.0, 0.0)
+    total = Gathered()
     if j >= 0:
         if points.role[j] != BACKGROUND:
             s = load_surface(points, j)
-            mine = rays_of(points, j, i, s, geo, rays, aimed, edge_samples, stride, seed, kept_out)
-            for k in range(mine.count):
-                ray = gathered_ray(geo, s, mine, k, kept_out)
+            even = share_of(rays, points, j, edge_samples)
+            sector = sector_of_objects(geo, s, int(float(even) * aimed))
+            if sector.rays > 0:
+                even = sector.rays
+            known = False
+            if kept_out.present != 0:
+                # As many even rays as before are the same rays: their numbers start by how many there are.
+                known = kept_out.point[i] == j and kept_out.count[i] == even
+                kept_out.point[i] = j
+                kept_out.count[i] = even
+            start = first_sample(even * pixel_points(points, j, edge_samples), even, stride, points, j)
+            for k in range(even):
+                disk = concentric_disk(sobol2(seed, 0, start + k, 11))
+                weight = ray_weight(sector, even, disk)
+                ray = ray_over(s, disk, weight)
                 if ray.up != 0:
+                    ray.real = kept_real(kept_out, known, i * rays + k, geo, ray.origin, ray.direction)
+                    ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
                     light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
-                    light = focused_incident(light, hits, geo, world, ray, mine.first_even + k)
-                    before += light.before * ray.weight
-                    after += light.after * ray.weight
-                    nearness += inverse_distance(light) * ray.weight
-            keep_known(kept_out, i, j, mine)
-    before_out[i] = before
-    after_out[i] = after
-    nearness_out[i] = nearness
+                    light = focused_incident(light, hits, geo, world, ray, start + k)
+                    total = add_light(total, light, weight)
+            for k in range(sector.rays):
+                ray = ray_over(s, sector_point(sector, sobol2(seed, 0, start + k, 12)), sector.weight)
+                if ray.up != 0:
+                    ray.real = trace_real(geo, ray.origin, ray.direction, FAR)
+                    ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
+                    light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
+                    light = focused_incident(light, hits, geo, world, ray, start + k)
+                    total = add_light(total, light, sector.weight)
+    before_out[i] = total.before
+    after_out[i] = total.after
+    nearness_out[i] = total.nearness
 
 
 @wp.kernel

@@ -81,6 +81,12 @@ def share_of(samples: int, points: Points, i: int, edge_samples: int) -> int:
 
 
 @wp.func
+def pixel_points(points: Points, i: int, edge_samples: int) -> int:
+    """How many points share the samples of a point's pixel."""
+    return wp.where(points.slot[i] >= 0, edge_samples, 1)
+
+
+@wp.func
 def spread_bits(x: wp.uint32) -> wp.uint32:
     """The lower 16 bits, a zero between any two."""
     y = x & wp.uint32(0x0000FFFF)
