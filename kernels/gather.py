@@ -156,8 +156,10 @@ class KeptRays:
 
 
 @wp.func
-def kept_real(kept: KeptRays, known: bool, at: int, geo: Geometry, origin: wp.vec3, direction: wp.vec3) -> Hit:
-    """The real surface along a ray: the kept one, or a traced one, which is kept."""
+def kept_real(
+    kept: KeptRays, keeps: bool, known: bool, at: int, geo: Geometry, origin: wp.vec3, direction: wp.vec3
+) -> Hit:
+    """The real surface along a ray: the kept one, or a traced one, which is kept if the ray is one of those."""
     hit = Hit()
     if known:
         hit.t = kept.reach[at]
@@ -165,7 +167,7 @@ def kept_real(kept: KeptRays, known: bool, at: int, geo: Geometry, origin: wp.ve
         hit.found = wp.where(hit.triangle >= 0, 1, 0)
     else:
         hit = trace_real(geo, origin, direction, FAR)
-        if kept.present != 0:
+        if keeps:
             kept.reach[at] = hit.t
             kept.triangle[at] = hit.triangle
     return hit
@@ -282,22 +284,22 @@ def _gather_rays(
                 kept_out.point[i] = j
                 kept_out.count[i] = even
             start = first_sample(even * pixel_points(points, j, edge_samples), even, stride, points, j)
-            for k in range(even):
-                disk = concentric_disk(sobol2(seed, 0, start + k, 11))
-                weight = ray_weight(sector, even, disk)
+            for k in range(even + sector.rays):
+                disk = wp.vec2()
+                weight = sector.weight
+                if k < even:
+                    disk = concentric_disk(sobol2(seed, 0, start + k, 11))
+                    weight = ray_weight(sector, even, disk)
+                else:
+                    disk = sector_point(sector, sobol2(seed, 0, start + k - even, 12))
                 ray = ray_over(s, disk, weight)
                 if ray.up != 0:
-                    ray.real = kept_real(kept_out, known, i * rays + k, geo, ray.origin, ray.direction)
+                    keeps = kept_out.present != 0 and k < even
+                    at = i * rays + k
+                    ray.real = kept_real(kept_out, keeps, keeps and known, at, geo, ray.origin, ray.direction)
                     ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
                     light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
                     total = add_light(total, light, weight)
-            for k in range(sector.rays):
-                ray = ray_over(s, sector_point(sector, sobol2(seed, 0, start + k, 12)), sector.weight)
-                if ray.up != 0:
-                    ray.real = trace_real(geo, ray.origin, ray.direction, FAR)
-                    ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
-                    light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
-                    total = add_light(total, light, sector.weight)
     before_out[i] = total.before
     after_out[i] = total.after
     nearness_out[i] = total.nearness
@@ -339,24 +341,23 @@ def _gather_rays_glossy(
                 kept_out.point[i] = j
                 kept_out.count[i] = even
             start = first_sample(even * pixel_points(points, j, edge_samples), even, stride, points, j)
-            for k in range(even):
-                disk = concentric_disk(sobol2(seed, 0, start + k, 11))
-                weight = ray_weight(sector, even, disk)
+            for k in range(even + sector.rays):
+                disk = wp.vec2()
+                weight = sector.weight
+                if k < even:
+                    disk = concentric_disk(sobol2(seed, 0, start + k, 11))
+                    weight = ray_weight(sector, even, disk)
+                else:
+                    disk = sector_point(sector, sobol2(seed, 0, start + k - even, 12))
                 ray = ray_over(s, disk, weight)
                 if ray.up != 0:
-                    ray.real = kept_real(kept_out, known, i * rays + k, geo, ray.origin, ray.direction)
+                    keeps = kept_out.present != 0 and k < even
+                    at = i * rays + k
+                    ray.real = kept_real(kept_out, keeps, keeps and known, at, geo, ray.origin, ray.direction)
                     ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
                     light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
                     light = focused_incident(light, hits, geo, world, ray, start + k)
                     total = add_light(total, light, weight)
-            for k in range(sector.rays):
-                ray = ray_over(s, sector_point(sector, sobol2(seed, 0, start + k, 12)), sector.weight)
-                if ray.up != 0:
-                    ray.real = trace_real(geo, ray.origin, ray.direction, FAR)
-                    ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
-                    light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
-                    light = focused_incident(light, hits, geo, world, ray, start + k)
-                    total = add_light(total, light, sector.weight)
     before_out[i] = total.before
     after_out[i] = total.after
     nearness_out[i] = total.nearness
