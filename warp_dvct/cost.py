@@ -231,8 +231,7 @@ def _gather(settings: Settings, survey: Survey, width: int, height: int, edges: 
 
 
 def gathered_on_real(settings: Settings, survey: Survey, points: float, entered: float, aimed: float) -> Counts:
-    """As :func:`gathered`, of points on real surfaces whose share ``aimed`` sends fewer rays, half of them into the
-    objects' box."""
+    """As :func:`gathered`, on real surfaces; a share ``aimed`` of the points sends fewer rays, half at the objects."""
     few = int(settings.gather_rays * settings.gather_aimed) if survey.plate else 0
     far = points * aimed if few > 0 else 0.0
     counts = gathered(survey, survey.on_real, points - far, settings.gather_rays, entered=entered)
