@@ -19,7 +19,7 @@ from warp_dvct.bench.error import MANY_BOUNCES, read, stage_file
 from warp_dvct.bench.references import Reference, ReferenceStore
 from warp_dvct.bench.rows import commit
 from warp_dvct.budget import check_request
-from warp_dvct.cost import load_model
+from warp_dvct.cost_model import load_model
 from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher
 from warp_dvct.metrics import flip_ldr, import_flip

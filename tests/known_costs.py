@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from warp_dvct.budget import Choice, choose
-from warp_dvct.cost import CostModel
+from warp_dvct.cost_model import CostModel
 
 
 def made_model(threads: int = 2) -> CostModel:

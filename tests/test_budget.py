@@ -14,16 +14,8 @@ from warp_dvct import Relighter
 from warp_dvct.accuracy import LADDERS
 from warp_dvct.budget import choose
 from warp_dvct.calibrate import calibrate, subdivide
-from warp_dvct.cost import (
-    FIRST_RAYS,
-    Sample,
-    count_work,
-    fit,
-    load_model,
-    model_file,
-    non_negative,
-    save_model,
-)
+from warp_dvct.cost import FIRST_RAYS, count_work
+from warp_dvct.cost_model import Sample, fit, load_model, model_file, non_negative, save_model
 from warp_dvct.errors import FileError, OptionError
 from warp_dvct.launch import Launcher
 from warp_dvct.scene import PointCloud, Role

@@ -9,8 +9,9 @@ from known_costs import chosen, made_model
 
 from warp_dvct.accuracy import BOUNCES, DENSITY, REFERENCE, STRIDE, load_accuracy
 from warp_dvct.budget import AIM, choose
-from warp_dvct.cost import CHOOSING, count_survey, count_work, shipped_model
+from warp_dvct.cost import CHOOSING, count_survey, count_work
 from warp_dvct.cost_cones import march_steps
+from warp_dvct.cost_model import shipped_model
 from warp_dvct.settings import QUALITIES, make_settings
 from warp_dvct.survey import survey
 from warp_dvct.usd.read import read_stage

@@ -12,7 +12,8 @@ from known_costs import chosen, made_model
 from warp_dvct import Relighter
 from warp_dvct.accuracy import load_accuracy
 from warp_dvct.budget import SHOWS
-from warp_dvct.cost import PROBE, price
+from warp_dvct.cost import PROBE
+from warp_dvct.cost_model import price
 from warp_dvct.pace import BELIEVED, LATER, Pace, try_machine, with_rays
 from warp_dvct.settings import Settings
 from warp_dvct.usd_scenes import path

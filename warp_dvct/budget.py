@@ -1,9 +1,9 @@
 """Choosing settings for a time or an error: ``warp-dvct relight --budget SECONDS`` and ``--max-error FLIP``.
 
-The time of a choice is predicted by the cost model (:mod:`warp_dvct.cost`), its error by a table of what each knob was
-measured to cost (:mod:`warp_dvct.accuracy`). Starting from the cheapest choice, and from the dearest preset that fits,
-the step that takes off the most squared error for its time is taken, again and again, until the time is used up or the
-error is reached.
+The time of a choice is predicted by the cost model (:mod:`warp_dvct.cost_model`), its error by a table of what each
+knob was measured to cost (:mod:`warp_dvct.accuracy`). Starting from the cheapest choice, and from the dearest preset
+that fits, the step that takes off the most squared error for its time is taken, again and again, until the time is used
+up or the error is reached.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from warp_dvct.accuracy import (
     load_accuracy,
     matters,
 )
-from warp_dvct.cost import CHOOSING, CostModel, Counts, count_survey, count_work, price
+from warp_dvct.cost import CHOOSING, count_survey, count_work
+from warp_dvct.cost_model import CostModel, Counts, price
 from warp_dvct.cost_vpls import count_vpl_work
 from warp_dvct.errors import OptionError
 from warp_dvct.pace import RAYS_SET, Pace

@@ -12,18 +12,8 @@ import numpy as np
 from warp_dvct import usd_scenes
 from warp_dvct.accuracy import LADDERS_OF, RAYS
 from warp_dvct.budget import choose
-from warp_dvct.cost import (
-    CHOOSING,
-    PROBE,
-    REST,
-    CostModel,
-    Sample,
-    count_survey,
-    count_work,
-    fit,
-    processor,
-    shipped_model,
-)
+from warp_dvct.cost import CHOOSING, PROBE, REST, count_survey, count_work
+from warp_dvct.cost_model import CostModel, Sample, fit, processor, shipped_model
 from warp_dvct.cost_vpls import RENAMED, count_vpl_work
 from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
+from warp_dvct.cost_model import Counts
 from warp_dvct.settings import Settings
 from warp_dvct.survey import Survey
 
@@ -12,8 +13,6 @@ TYPICAL_COSINE = 2.0 / 3.0  # to the normal, of cones that share the cosine-weig
 HALF_OF_LOBE = 4.0  # aperture of a glossy cone over atan(alpha), see ``kernels.specular``
 WIDEST, NARROWEST = 3.0, 1e-3  # radians of aperture
 MIDWAY = 0.5  # of a volume's edge: about how far a march comes in it before it leaves or meets a wall
-
-Counts = dict[str, float]
 
 
 def by_cones(settings: Settings) -> tuple[bool, bool, bool]:

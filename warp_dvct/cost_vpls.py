@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from warp_dvct.cost import Counts, direct_work, draws, frame_work, tree_depth
+from warp_dvct.cost import direct_work, draws, frame_work, tree_depth
+from warp_dvct.cost_model import Counts
 from warp_dvct.passes.vpl_memory import surface_vpls, vpl_count
 from warp_dvct.settings import Settings
 from warp_dvct.survey import Survey

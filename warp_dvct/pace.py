@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warp_dvct.cost import REST, Counts, gathered, gathered_on_real, gathered_points, price
+from warp_dvct.cost import REST, gathered, gathered_on_real, gathered_points
+from warp_dvct.cost_model import Counts, price
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import probe
 from warp_dvct.launch import Launcher

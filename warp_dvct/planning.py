@@ -12,7 +12,8 @@ import numpy as np
 import warp as wp
 
 from warp_dvct.budget import AIM, Choice, check_request, choose
-from warp_dvct.cost import PROBE, CostModel, load_model, price
+from warp_dvct.cost import PROBE
+from warp_dvct.cost_model import CostModel, load_model, price
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.errors import OptionError
 from warp_dvct.launch import Launcher

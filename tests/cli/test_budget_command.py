@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from warp_dvct.cost import DEFAULT_FILE, model_file
+from warp_dvct.cost_model import DEFAULT_FILE, model_file
 
 
 @pytest.fixture(autouse=True)

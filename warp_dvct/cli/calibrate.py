@@ -23,7 +23,7 @@ def calibrate(device: str, threads: int | None, frames: int, seed: int, out: Pat
         check_writable(out)
     start_warp(device)
     from warp_dvct.calibrate import calibrate as measure
-    from warp_dvct.cost import model_file, save_model
+    from warp_dvct.cost_model import model_file, save_model
 
     with Progress("calibrate") as progress:
         model, samples = measure(device, threads, frames=frames, seed=seed, report=progress.update)
