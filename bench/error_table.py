@@ -24,6 +24,7 @@ from warp_dvct.accuracy import (
     DETAILS,
     FORMS,
     LADDERS_OF,
+    LEAST_NOISE,
     OVERLAP,
     REFERENCE,
     REFERENCE_OF,
@@ -33,23 +34,42 @@ from warp_dvct.accuracy import (
     form_table,
     kind_of,
     missing_bounces,
+    sizes,
     stride_table,
 )
 from warp_dvct.bench.error import read, stage_file
 from warp_dvct.errors import OptionError
 from warp_dvct.image import write_text
 from warp_dvct.launch import Launcher
+from warp_dvct.pilot import FLIP_POWER
 from warp_dvct.settings import NAMES, Settings, make_settings
 from warp_dvct.survey import Survey, survey
 
 LEAST = 1e-4  # FLIP below which a stage says nothing
+# Powers of ``sizes`` towards which a fit is pulled: an error is mostly noise, and in proportion to both together.
+TYPICAL = {"noise": 0.7, "shown": 0.3, "change": 0.0}
 
 
-def fit_table(rows: Sequence[Mapping[str, Any]]) -> tuple[Accuracy, list[tuple[str, float, float]]]:
-    """The table, and for each row its name, measured and predicted FLIP.
+@dataclass(frozen=True)
+class Fit:
+    """A table and how well it holds.
+
+    Attributes:
+        points: Of each row its name, measured and predicted FLIP.
+        unseen: By stage, FLIP measured at the reference and as predicted from the other stages alone.
+    """
+
+    table: Accuracy
+    points: list[tuple[str, float, float]]
+    unseen: dict[str, tuple[float, float]]
+
+
+def fit_table(rows: Sequence[Mapping[str, Any]]) -> Fit:
+    """The table that fits some rows best.
 
     Args:
-        rows: Of ``bench tradeoff``, of several stages; path tracing, which has no table, is left aside.
+        rows: Of ``bench tradeoff``, of several stages; path tracing, which has no table, is left aside. A stage without
+            noise says what outlines cost, the others all else.
     Raises:
         OptionError: No stage has the base point, or no knob was swept.
     """
@@ -59,7 +79,9 @@ def fit_table(rows: Sequence[Mapping[str, Any]]) -> tuple[Accuracy, list[tuple[s
     for stage in dict.fromkeys(r["stage"] for r in rows):
         scene = read(stage_file(stage))
         surveys[stage] = survey(scene, make_settings(), launcher, scene.camera.aspect, has_plate=True)
-    sweeps = {method: _Sweep.of(method, rows) for method in LADDERS_OF}
+    still = {stage for stage, found in surveys.items() if found.noise <= LEAST_NOISE}
+    sweeps = {method: _Sweep.of(method, [r for r in rows if r["stage"] not in still]) for method in LADDERS_OF}
+    outlines = _Sweep.of("delta-cones", [r for r in rows if r["stage"] in still])
     cones = sweeps["delta-cones"]
     if not cones.base:
         raise OptionError("no stage has the reference point; docs/tradeoff.md says how to measure it")
@@ -67,16 +89,17 @@ def fit_table(rows: Sequence[Mapping[str, Any]]) -> tuple[Accuracy, list[tuple[s
     if not any(knobs.values()):
         raise OptionError("no knob was swept; run bench tradeoff --knob gather.rays and others first")
     coefficients = _power_law(cones, surveys) | {"bounces": _bounces(cones, surveys)}
-    vpls = sweeps["instant-radiosity"]
-    coefficients |= _constants(vpls, surveys, coefficients)
+    coefficients |= _constants(sweeps["instant-radiosity"], surveys)
+    coefficients["outlined"] = _outlined(outlines.points, surveys)
     kinds = {stage: kind_of(found) for stage, found in surveys.items()}
 
     def compare(table: Accuracy, methods: Sequence[str], kind: str = "") -> list[tuple[str, float, float]]:
         return [
             (f"{method} {s} {w} {_name(method, settings)}", flip, table.error(settings, surveys[s], w, method))
             for method in methods
-            for (s, w, settings), flip in sweeps[method].points.items()
-            if flip > LEAST and sweeps[method].base and kind in ("", kinds[s])
+            for sweep in (sweeps[method], outlines)
+            for (s, w, settings), flip in sweep.points.items()
+            if sweep.method == method and flip > LEAST and sweeps[method].base and kind in ("", kinds[s])
         ]
 
     def spread(table: Accuracy, kind: str = "") -> float:
@@ -87,7 +110,8 @@ def fit_table(rows: Sequence[Mapping[str, Any]]) -> tuple[Accuracy, list[tuple[s
         powers = [{**coefficients, f"{kind} {OVERLAP}": float(power)} for power in np.arange(0.1, 1.61, 0.05)]
         coefficients = min(powers, key=lambda base, kind=kind: spread(Accuracy(base, knobs, 0.0), kind))
     best = Accuracy(coefficients, knobs, 0.0)
-    return replace(best, spread=spread(best)), compare(best, list(LADDERS_OF))
+    best = replace(best, spread=spread(best))
+    return Fit(best, compare(best, list(LADDERS_OF)), _unseen(cones, surveys))
 
 
 def net_flip(row: Mapping[str, Any]) -> float:
@@ -219,30 +243,25 @@ def _falling(values: np.ndarray) -> np.ndarray:
     return np.concatenate([np.full(int(n), v) for v, n in blocks]) if blocks else values
 
 
-def _constants(sweep: _Sweep, surveys: Mapping[str, Survey], coefficients: Mapping[str, float]) -> dict[str, float]:
-    """Of a method of which few stages were measured: by class, what is left of log FLIP beside the known powers."""
+def _constants(sweep: _Sweep, surveys: Mapping[str, Survey]) -> dict[str, float]:
+    """Of a method of which few stages were measured: FLIP in proportion to what the objects change, by class."""
     found: dict[str, list[float]] = {}
     for stage, flip in sweep.base.items():
-        left = math.log(flip) - sum(coefficients[name] * size for name, size in _sizes(surveys[stage]).items())
+        left = math.log(flip) - sizes(surveys[stage])["shown"]
         found.setdefault(class_of("", surveys[stage], sweep.method), []).append(left)
-    return {kind: float(np.mean(values)) for kind, values in found.items()}
-
-
-def _sizes(survey: Survey) -> dict[str, float]:
-    """Logarithms whose multiples make that of FLIP at the reference, see ``Accuracy.reference``."""
-    return {"shown": math.log(max(survey.shown, 1e-4)), "change": math.log(max(survey.change, 1e-2))}
+    return {kind: float(np.mean(values)) for kind, values in found.items()} | {f"{sweep.method} shown": 1.0}
 
 
 def _power_law(sweep: _Sweep, surveys: Mapping[str, Survey]) -> dict[str, float]:
-    """Log FLIP = constants of the classes + powers of what the objects change + power * log(width / 320)."""
+    """Log FLIP = constants of the classes + powers of ``sizes`` + power * log(width / 320)."""
     base, points, main = sweep.base, sweep.points, sweep.main
     stages = list(base)
     columns = [[float(kind_of(surveys[s]) == k) for s in stages] for k in ("diffuse", "glossy")]
-    columns += [[_sizes(surveys[s])[name] for s in stages] for name in ("shown", "change")]
+    columns += [[sizes(surveys[s])[name] for s in stages] for name in TYPICAL]
     matrix, values = np.array(columns).T, np.log([base[s] for s in stages])
-    # A little pull towards errors in proportion to the change keeps the powers sensible where there are few stages.
-    pull = np.diag([0.0, 0.0, 0.3, 0.1])[2:]
-    found = np.linalg.lstsq(np.vstack([matrix, pull]), np.append(values, [0.3, 0.0]), rcond=None)[0]
+    # The pull lets few stages decide no more than they can.
+    pull = np.hstack([np.zeros((len(TYPICAL), 2)), np.eye(len(TYPICAL))])
+    found = np.linalg.lstsq(np.vstack([matrix, pull]), np.append(values, list(TYPICAL.values())), rcond=None)[0]
     slopes = []
     for (stage, width, settings), flip in points.items():
         at_main = points.get((stage, main, settings), 0.0)
@@ -253,10 +272,29 @@ def _power_law(sweep: _Sweep, surveys: Mapping[str, Survey]) -> dict[str, float]
     return {
         "diffuse": float(found[0]) + shift,
         "glossy": (float(found[1]) if any(columns[1]) else float(found[0])) + shift,
-        "shown": float(found[2]),
-        "change": float(found[3]),
+        **dict(zip(TYPICAL, map(float, found[2:]), strict=True)),
         "width": slope,
     }
+
+
+def _unseen(sweep: _Sweep, surveys: Mapping[str, Survey]) -> dict[str, tuple[float, float]]:
+    """See ``Fit.unseen``; nothing of fewer than three stages."""
+    found = {}
+    for stage, flip in sweep.base.items() if len(sweep.base) > 2 else ():
+        others = replace(sweep, base={s: f for s, f in sweep.base.items() if s != stage})
+        found[stage] = flip, Accuracy(_power_law(others, surveys), {}, 0.0).reference(surveys[stage], sweep.main)
+    return found
+
+
+def _outlined(points: Mapping[Any, float], surveys: Mapping[str, Survey]) -> float:
+    """FLIP of outlines of one point a pixel over ``Survey.outlined`` for each pixel of the width: the mean of stages in
+    which nothing else errs; 0 where none was measured."""
+    ratios = [
+        flip * width / surveys[stage].outlined * (1.0 + settings.antialias) ** FLIP_POWER
+        for (stage, width, settings), flip in points.items()
+        if flip > LEAST and surveys[stage].outlined > 0.0
+    ]
+    return float(np.mean(ratios)) if ratios else 0.0
 
 
 def _bounces(sweep: _Sweep, surveys: Mapping[str, Survey]) -> float:

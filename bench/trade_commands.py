@@ -192,15 +192,18 @@ def error_table(files: tuple[Path, ...], out: Path | None) -> None:
     start_warp("cpu")
     from warp_dvct.bench import error_table as module
 
-    table, pairs = module.fit_table([row for file in files for row in _some_rows(file, "tradeoff")])
-    ratios = [measured / max(predicted, 1e-9) for _, measured, predicted in pairs]
+    fit = module.fit_table([row for file in files for row in _some_rows(file, "tradeoff")])
+    ratios = [measured / max(predicted, 1e-9) for _, measured, predicted in fit.points]
     near = sum(1 / 1.5 <= ratio <= 1.5 for ratio in ratios)
-    click.echo(f"{len(pairs)} points; predicted within a factor of 1.5: {near}; spread {table.spread:.0%}")
-    for (name, measured, predicted), ratio in zip(pairs, ratios, strict=True):
+    click.echo(f"{len(ratios)} points; predicted within a factor of 1.5: {near}; spread {fit.table.spread:.0%}")
+    for (name, measured, predicted), ratio in zip(fit.points, ratios, strict=True):
         if not 1 / 1.5 <= ratio <= 1.5:
             click.echo(f"  {name}: measured {measured:.4f}, predicted {predicted:.4f}")
+    if fit.unseen:
+        click.echo("each stage by a fit to the others, measured over predicted at the reference:")
+        click.echo("  " + ", ".join(f"{stage} {flip / expected:.2f}" for stage, (flip, expected) in fit.unseen.items()))
     if out is not None:
-        module.write_table(table, out)
+        module.write_table(fit.table, out)
 
 
 @click.command()

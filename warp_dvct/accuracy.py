@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from warp_dvct.errors import FileError
+from warp_dvct.pilot import ALL_BOUNCES, FLIP_POWER
 from warp_dvct.settings import NAMES, Settings
-from warp_dvct.survey import ALL_BOUNCES, FLIP_POWER, Survey
+from warp_dvct.survey import Survey
 
 TABLE_FILE = Path(__file__).with_name("accuracy.json")
 # The point that the table of errors is relative to.
@@ -46,6 +47,7 @@ OVERLAP = "overlap"
 FORMS = {"gather": "cones", "shadows": "cone", "glossy": "cones"}  # settings that may ask for cones
 FINE_SHARE = 0.25  # of what too few texels cost, that of the fine volume; the table's points leave 0 to 0.6 open
 LEAST_DECAY = 0.05  # of light from bounce to bounce; less is not told from none
+LEAST_NOISE = 1e-6  # of ``Survey.noise``: less is rounding
 DETAILS = (0.0, 0.3, 0.15, 0.075)
 FURTHER = ("patches.count", "patches.rays")  # knobs of the second and further bounces
 OBJECT_STRIDE = {16: 8, 12: 6, 8: 4, 6: 3, 4: 2, 2: 1, 1: 1}
@@ -110,7 +112,8 @@ class Accuracy:
     Attributes:
         base: Coefficients of the logarithm of FLIP at the reference, see :meth:`reference`; ``diffuse overlap`` and
             ``glossy overlap``, the powers by which improvements of several knobs together fall short of their product;
-            ``bounces``, FLIP of missing bounces over ``Survey.later``.
+            ``bounces``, FLIP of missing bounces over ``Survey.later``; ``outlined``, FLIP of the objects' outlines, of
+            one point a pixel, over ``Survey.outlined`` for each pixel of the width.
         knobs: By class of scene and knob: values, and by how much squared FLIP exceeds that of ``REFERENCE``, over it.
             Knobs of patches go by ``open`` and ``closed`` scenes, the others by ``diffuse`` and ``glossy`` ones.
             Strides have a table for each of ``DETAILS`` (:func:`stride_table`); forms that ask for cones one of a
@@ -123,12 +126,16 @@ class Accuracy:
     spread: float
 
     def reference(self, survey: Survey, width: int, method: str = "delta-cones") -> float:
-        """FLIP at the method's reference: by class, powers of what the objects change in the picture (``Survey.shown``
-        and ``change``) and of its width."""
-        power = self.base["shown"] * math.log(max(survey.shown, 1e-4))
-        power += self.base["change"] * math.log(max(survey.change, 1e-2))
-        power += self.base["width"] * math.log(width / 320.0)
+        """FLIP at the method's reference, outlines left aside: by class, powers of :func:`sizes` and of the width."""
+        power = self.base["width"] * math.log(width / 320.0)
+        prefix = "" if method == "delta-cones" else f"{method} "
+        power += sum(self.base.get(prefix + name, 0.0) * size for name, size in sizes(survey).items())
         return math.exp(self.base[class_of("", survey, method)] + power)
+
+    def outlines(self, settings: Settings, survey: Survey, width: int) -> float:
+        """FLIP of the objects' outlines, whose pixels are off by a part of the step that is there: one over the points
+        that such a pixel gets, in FLIP's power of it."""
+        return self.base["outlined"] * survey.outlined / width * (1.0 + settings.antialias) ** -FLIP_POWER
 
     def error(self, settings: Settings, survey: Survey, width: int, method: str = "delta-cones") -> float:
         """Mean LDR-FLIP of the picture against many bounces."""
@@ -136,7 +143,8 @@ class Accuracy:
             return 0.0
         found = [self.excess(ladder.knob, settings, survey, method) for ladder in LADDERS_OF[method]]
         found += self.forms(settings, survey, method)
-        return self.reference(survey, width, method) * math.sqrt(self.combined(found, survey))
+        square = self.reference(survey, width, method) ** 2 * self.combined(found, survey)
+        return math.sqrt(square + self.outlines(settings, survey, width) ** 2)
 
     def combined(self, excesses: Iterable[float], survey: Survey) -> float:
         """Squared FLIP over that at the reference, of settings whose knobs one by one exceed it by these."""
@@ -247,6 +255,12 @@ def load_accuracy() -> Accuracy:
         return Accuracy(dict(data["base"]), dict(data["knobs"]), float(data["spread"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise FileError(f"{TABLE_FILE} is no table of errors ({error}); install the package again") from error
+
+
+def sizes(survey: Survey) -> dict[str, float]:
+    """Logarithms of what the error at the reference goes by, see ``Accuracy.reference``."""
+    least = {"noise": LEAST_NOISE, "shown": 1e-4, "change": 1e-2}
+    return {name: math.log(max(getattr(survey, name), value)) for name, value in least.items()}
 
 
 def class_of(knob: str, survey: Survey, method: str = "delta-cones") -> str:

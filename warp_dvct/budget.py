@@ -208,7 +208,8 @@ class _Chooser:
         if not self.survey.changes:
             return 0.0
         found = (self.excess(ladder.knob, settings) for ladder in LADDERS_OF[self.method])
-        return self.reference**2 * self.accuracy.combined((*found, *self.forms), self.survey)
+        outlines = self.accuracy.outlines(settings, self.survey, self.width)
+        return self.reference**2 * self.accuracy.combined((*found, *self.forms), self.survey) + outlines**2
 
     def excess(self, knob: str, settings: Settings) -> float:
         """As ``Accuracy.excess``, looked up once."""

@@ -13,8 +13,9 @@ from functools import lru_cache
 from warp_dvct.cost_cones import by_cones, gathered_by_cones, glossy_cones, shadow_cones
 from warp_dvct.cost_model import Counts
 from warp_dvct.gather_need import GatherNeed
+from warp_dvct.pilot import VolumeNeed
 from warp_dvct.settings import Settings
-from warp_dvct.survey import MapNeed, PointNeed, Survey, VolumeNeed
+from warp_dvct.survey import MapNeed, PointNeed, Survey
 
 REST = "rest"  # of a frame's time, what is in no pass
 CHOOSING = "choosing"  # the search for settings

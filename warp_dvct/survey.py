@@ -7,8 +7,7 @@ picture, so they hold for any size; nothing in it is timed, so the same scene gi
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -17,45 +16,16 @@ import warp as wp
 from warp_dvct import gather_need
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.gather_need import GatherNeed, Seen, View
-from warp_dvct.kept import Kept
 from warp_dvct.kernels import survey as kernels
 from warp_dvct.kernels.specular import BLURRED
 from warp_dvct.launch import Launcher
-from warp_dvct.layers import Layers
-from warp_dvct.methods import delta_cone_tracing
-from warp_dvct.metrics import affected_mask, smooth_delta, to_display
-from warp_dvct.passes.composite import composite
-from warp_dvct.passes.gather import glossy_hits
 from warp_dvct.passes.gbuffer import GBuffer, render_gbuffer
-from warp_dvct.passes.voxels import Voxels
-from warp_dvct.passes.vpls import LUMINANCE
+from warp_dvct.pilot import WIDTH, VolumeNeed, make_pilot, plan_pilot
 from warp_dvct.plan import Plan, make_plan
 from warp_dvct.scene import Light, LightKind, Role, Scene
 from warp_dvct.settings import Settings, make_settings
 
-WIDTH = 80
 RAYS = 8  # of a point, to see what is around it
-FRAGMENTS_PER_RECORD = 1.15  # of triangles larger than voxels
-ALL_BOUNCES = 8  # as the truths that errors are measured against
-FLIP_POWER = 0.7  # of a pixel's difference in colour that LDR-FLIP takes (Andersson et al. 2020, "FLIP", section 4.1)
-COARSE = {
-    "bounces": ALL_BOUNCES,
-    "antialias": 0,
-    "volume.resolution": 32,
-    "volume.coarse": 32,
-    "rsm.texels": 96,
-    "rsm.density": 1,
-    "shadows.samples": 4,
-    "shadows.probes": 4,
-    "gather.rays": 16,
-    "gather.aimed": 0,  # the same rays with the light before as without: their noise cancels in differences
-    "gather.object_rays": 16,
-    "gather.stride": 4,
-    "gather.object_stride": 2,
-    "glossy.rays": 2,
-    "patches.count": 2400,
-    "patches.rays": 4,
-}
 # At which map sizes are taken.
 REFERENCE = {"volume.resolution": 256, "volume.coarse": 128, "rsm.texels": 8192, "rsm.density": 1}
 
@@ -71,26 +41,6 @@ class MapNeed:
     coarse: float
     pair: bool
     aperture: float | None
-
-
-@dataclass(frozen=True)
-class VolumeNeed:
-    """What a volume held when it had ``n`` voxels an edge: voxels with surface, and pieces of triangles in them."""
-
-    n: int
-    records: int
-    fragments: int
-
-    def records_at(self, n: int) -> float:
-        """Voxels that hold surface go by the square of those along an edge."""
-        return self.records * (n / self.n) ** 2
-
-    def fragments_at(self, n: int) -> float:
-        """Pieces of triangles: inside of a voxel one each; across voxels' borders by the voxels along an edge; of what
-        is larger than a voxel by the voxels' number."""
-        more = self.records_at(n) - self.records
-        small = max(self.fragments - FRAGMENTS_PER_RECORD * self.records, 0.0)
-        return max(self.fragments + FRAGMENTS_PER_RECORD * more + 0.01 * small * (n - self.n), self.records_at(n))
 
 
 @dataclass(frozen=True)
@@ -143,8 +93,11 @@ class Survey:
         affected: Share of the pixels that the objects cover or change by more than 0.01.
         change: Mean over affected pixels of the change's size, over the mean picture.
         shown: Mean over the picture of the ``FLIP_POWER`` of the change in display luma that the objects make.
-        later: The same of the light of further bounces than the first. decay: Light of a bounce over that of the one
-            before.
+        noise: The same of the difference between two such pictures by other random numbers.
+        outlined: The same of the steps that change makes from pixel to pixel where an object begins or ends, summed
+            over them for each row of the picture.
+        later: As ``shown``, of the light of further bounces than the first. decay: Light of a bounce over that of the
+            one before.
         changes: Whether anything is synthetic or a light is added. plate: Whether a plate will be given.
         feature: Smallest extent of a synthetic mesh, in edges of the fine volume; 0 where there is none.
         voxel: Edge of the fine volume in metres. reach: Edge of the coarse one, in edges of the fine one; 1 for none.
@@ -171,6 +124,8 @@ class Survey:
     affected: float
     change: float
     shown: float
+    noise: float
+    outlined: float
     later: float
     decay: float
     changes: bool
@@ -211,12 +166,10 @@ def survey(scene: Scene, settings: Settings, launcher: Launcher, aspect: float, 
     fixed["glossy.roughness"] = settings.glossy_roughness
     height = max(16, round(WIDTH / aspect))
     needs = make_plan(scene, make_settings("balanced", {**REFERENCE, **fixed}), "delta-cones", WIDTH, height)
-    plan = make_plan(scene, make_settings("balanced", {**COARSE, **fixed}), "delta-cones", WIDTH, height)
+    plan = plan_pilot(scene, height, fixed)
     device_scene = DeviceScene.upload(launcher, scene, np.asarray(plan.origin), plan.scale)
-    direct = make_plan(
-        scene, make_settings("balanced", {**COARSE, **fixed, "bounces": 1}), "delta-cones", WIDTH, height
-    )
-    pilot = _pilot(scene, device_scene, launcher, plan, direct)
+    once, again = (plan_pilot(scene, height, {**fixed, **other}) for other in ({"bounces": 1}, {"seed": 1}))
+    pilot = make_pilot(scene, device_scene, launcher, plan, once, again)
     least = settings.gather_change if has_plate else 0.0
     seen = _look(scene, device_scene, launcher, plan, 2 * height, pilot.changed(least))
     return Survey(
@@ -237,11 +190,7 @@ def survey(scene: Scene, settings: Settings, launcher: Launcher, aspect: float, 
         coarse=pilot.coarse,
         patches=pilot.patches,
         **seen,
-        affected=pilot.affected,
-        change=pilot.change,
-        shown=pilot.shown,
-        later=pilot.later,
-        decay=pilot.decay,
+        **asdict(pilot.picture),
         changes=plan.changes,
         plate=has_plate,
         feature=_feature(scene) * plan.scale,
@@ -250,90 +199,6 @@ def survey(scene: Scene, settings: Settings, launcher: Launcher, aspect: float, 
         roughness=_smoothest(scene) if plan.glossy else None,
         focuses=pilot.focuses,
     )
-
-
-@dataclass(frozen=True)
-class _Pilot:
-    """The coarse picture and its volumes; see :class:`Survey`. ``layers`` is None where nothing changes."""
-
-    fine: VolumeNeed
-    coarse: VolumeNeed | None
-    patches: float
-    layers: Layers | None
-    affected: float
-    change: float
-    shown: float
-    later: float
-    decay: float
-    shape: tuple[int, int]
-    focuses: bool
-
-    def changed(self, least: float) -> np.ndarray:
-        """Pixels whose light changes by more than a share ``least`` of it, bool ``[h, w]``."""
-        if self.layers is None or least <= 0.0:
-            return np.ones(self.shape, bool)
-        # Fewer rays see a small change in fewer places: half of it counts.
-        size = np.abs(self.layers.delta).max(-1) >= 0.5 * least * self.layers.plate.max(-1)
-        return size | (self.layers.mask_synthetic > 0.0)
-
-
-def _pilot(scene: Scene, device_scene: DeviceScene, launcher: Launcher, plan: Plan, once: Plan) -> _Pilot:
-    """Volumes of few voxels, and pictures that say how much the objects change and how much comes after one bounce.
-
-    Args:
-        once: ``plan`` with a single bounce.
-    """
-    kept = Kept()
-    lit = delta_cone_tracing.light_volumes(launcher, scene, device_scene, plan, kept)
-    needs = [VolumeNeed(v.box.n, v.level_records[0], v.fragments.count) for v in lit.volumes]
-    fine = needs[0] if needs else VolumeNeed(plan.fine.n, 0, 0)
-    patches = 0.0
-    if lit.bounces.present:
-        records = lit.volumes[-1].level_records[lit.bounces.level]
-        patches = lit.bounces.irradiance.shape[0] // 2 / max(records, 1)  # before and after
-    focusing = glossy_hits(launcher, scene, device_scene, lit.bounces, 0) is not None
-    layers, affected, change, shown, later, decay = None, 0.0, 0.0, 0.0, 0.0, 0.0
-    if plan.changes:
-        radiance = delta_cone_tracing.render(launcher, scene, device_scene, lit, plan, with_before=True, kept=kept)
-        layers = composite(launcher, radiance, None)
-        mask = affected_mask(smooth_delta(layers.delta, layers.mask_synthetic), layers.mask_synthetic)
-        level = float(np.abs(layers.comp).mean())
-        if mask.any() and level > 0.0:
-            affected = float(mask.mean())
-            change = float(np.abs(layers.comp - layers.plate)[mask].mean()) / level
-        first = delta_cone_tracing.light_volumes(launcher, scene, device_scene, once, kept)
-        radiance = delta_cone_tracing.render(launcher, scene, device_scene, first, once, with_before=False, kept=kept)
-        shown = _difference(layers.comp, layers.plate)
-        later = _difference(layers.comp, composite(launcher, radiance, layers.plate).comp)
-        decay = _decay(_light(lit.volumes), _light(first.volumes))
-    coarse = needs[1] if len(needs) > 1 else None
-    shape = plan.height, plan.width
-    return _Pilot(fine, coarse, patches, layers, affected, change, shown, later, decay, shape, focusing)
-
-
-def _difference(picture: np.ndarray, other: np.ndarray) -> float:
-    """About what LDR-FLIP says, over a constant: the mean of its power of the change in display luma."""
-    return float(((np.abs(to_display(picture) - to_display(other)) @ LUMINANCE) ** FLIP_POWER).mean())
-
-
-def _light(volumes: Sequence[Voxels]) -> float:
-    """Flux that leaves the surfaces after, in arbitrary units."""
-    total = 0.0
-    for voxels in volumes:
-        count = voxels.level_records[0]
-        field = voxels.volume.field.numpy()[: 12 * count].reshape(count, 6, 2, 4)
-        total += float(field[:, :, 1, :3].sum(dtype=np.float64)) * voxels.box.voxel**2
-    return total
-
-
-def _decay(every: float, first: float) -> float:
-    """The ratio of the geometric series of ``ALL_BOUNCES`` terms whose sum over its first term is ``every / first``."""
-    low, high = 0.0, 1.0
-    for _ in range(20):
-        ratio = 0.5 * (low + high)
-        less = sum(ratio**k for k in range(ALL_BOUNCES)) * first < every
-        low, high = (ratio, high) if less else (low, ratio)
-    return low
 
 
 def _look(

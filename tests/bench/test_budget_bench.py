@@ -142,7 +142,8 @@ def test_a_table_holds_what_the_rows_say():
         for rays, factor in ((16, 2.0), (64, 1.0), (128, 1.1), (256, 0.8)):
             rays_ = {"gather__rays": rays, "gather__object_rays": rays}
             rows.append(sweep_row(stage, base * factor, noise=0.01, **rays_))
-    table, pairs = error_table.fit_table(rows)
+    fit = error_table.fit_table(rows)
+    table, pairs = fit.table, fit.points
     values = dict(table.knobs["diffuse"]["gather.rays"])
     assert values[16.0] == pytest.approx(3.0, abs=1e-3)
     assert values[64.0] == values[128.0] == pytest.approx(0.105, abs=1e-3)  # pooled: 1 and 1.21
@@ -160,7 +161,8 @@ def test_a_table_knows_cones_and_missing_bounces():
         rows += [sweep_row(stage, base * f, gather="cones", cones__count=n) for n, f in ((4, 3.0), (9, 2.0))]
         rows.append(sweep_row(stage, base * 1.5, shadows="cone"))
         rows.append(sweep_row(stage, base * 4.0, bounces=1))
-    table, pairs = error_table.fit_table(rows)
+    fit = error_table.fit_table(rows)
+    table, pairs = fit.table, fit.points
     assert table.knobs["diffuse"]["cones.count"] == [[4.0, 8.0], [9.0, 3.0]]
     assert table.knobs["diffuse"]["shadows=cone"] == [[1.0, 1.25]]
     assert table.base["bounces"] > 0
@@ -172,6 +174,25 @@ def test_a_table_knows_cones_and_missing_bounces():
     assert ratio == pytest.approx(math.sqrt(1.0 + 3.0 + 1.25), abs=1e-3)
     for name, measured, predicted in pairs:
         assert predicted == pytest.approx(measured, rel=0.6), name
+
+
+def test_noise_decides_and_outlines_are_left_where_there_is_none():
+    """FLIP in proportion to the noise that a survey sees comes back, each stage from the others too; the furnace, where
+    every ray brings the same light, says what outlines cost and nothing else."""
+    rows = []
+    for stage in ("room_area", "colour_bleeding", "ground_dome", "bunny"):
+        scene = read(stage_file(stage))
+        noise = survey(scene, make_settings(), Launcher("cpu"), scene.camera.aspect, has_plate=True).noise
+        assert noise > 0.005
+        rows += [sweep_row(stage, 0.8 * noise), sweep_row(stage, 1.6 * noise, gather__rays=16, gather__object_rays=16)]
+    rows += [sweep_row("furnace", flip, antialias=n) for n, flip in ((0, 0.002), (8, 0.002 * 9**-0.7))]
+    fit = error_table.fit_table(rows)
+    assert set(fit.unseen) == {"room_area", "colour_bleeding", "ground_dome", "bunny"}
+    for stage, (flip, expected) in fit.unseen.items():
+        assert expected == pytest.approx(flip, rel=0.3), stage
+    for name, measured, predicted in fit.points:
+        assert predicted == pytest.approx(measured, rel=0.02 if "furnace" in name else 0.15), name
+    assert fit.table.base["noise"] > 0.7
 
 
 def test_a_table_needs_a_base_and_a_knob():
