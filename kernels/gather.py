@@ -1,5 +1,7 @@
 """Indirect light at shading points: cones or exact rays into the radiosity volume."""
 
+from typing import Any
+
 import warp as wp
 
 from warp_dvct.kernels.aim import ray_weight, sector_of_objects, sector_point
@@ -238,9 +240,72 @@ def focused_incident(light: Incident, hits: GlossyHits, geo: Geometry, world: Wo
     return result
 
 
+@wp.struct
+class Lambertian:
+    """Stands for ``GlossyHits`` where no surface sends light to places."""
+
+    present: wp.int32
+
+
+@wp.func
+def focused_incident(  # noqa: F811 - an overload for other hits
+    light: Incident, hits: Lambertian, geo: Geometry, world: World, ray: Ray, sample: int
+) -> Incident:
+    return light
+
+
 @wp.func
 def inverse_distance(light: Incident) -> float:
     return 1.0 / wp.max(wp.min(light.distance_before, light.distance_after), 1.0e-6)
+
+
+@wp.func
+def gather_at(
+    i: int,
+    j: int,
+    points: Points,
+    geo: Geometry,
+    world: World,
+    hits: Any,
+    rays: int,
+    aimed: float,
+    edge_samples: int,
+    stride: int,
+    seed: int,
+    kept_out: KeptRays,
+) -> Gathered:
+    """Of the rays of point ``j``, the ``i``-th that is gathered; ``hits``: ``GlossyHits`` or ``Lambertian``."""
+    total = Gathered()
+    s = load_surface(points, j)
+    even = share_of(rays, points, j, edge_samples)
+    sector = sector_of_objects(geo, s, int(float(even) * aimed))
+    if sector.rays > 0:
+        even = sector.rays
+    known = False
+    if kept_out.present != 0:
+        # As many even rays as before are the same rays: their numbers start by how many there are.
+        known = kept_out.point[i] == j and kept_out.count[i] == even
+        kept_out.point[i] = j
+        kept_out.count[i] = even
+    start = first_sample(even * pixel_points(points, j, edge_samples), even, stride, points, j)
+    for k in range(even + sector.rays):
+        disk = wp.vec2()
+        weight = sector.weight
+        if k < even:
+            disk = concentric_disk(sobol2(seed, 0, start + k, 11))
+            weight = ray_weight(sector, even, disk)
+        else:
+            disk = sector_point(sector, sobol2(seed, 0, start + k - even, 12))
+        ray = ray_over(s, disk, weight)
+        if ray.up != 0:
+            keeps = kept_out.present != 0 and k < even
+            at = i * rays + k
+            ray.real = kept_real(kept_out, keeps, keeps and known, at, geo, ray.origin, ray.direction)
+            ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
+            light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
+            light = focused_incident(light, hits, geo, world, ray, start + k)
+            total = add_light(total, light, weight)
+    return total
 
 
 @wp.kernel
@@ -272,34 +337,8 @@ def _gather_rays(
     total = Gathered()
     if j >= 0:
         if points.role[j] != BACKGROUND:
-            s = load_surface(points, j)
-            even = share_of(rays, points, j, edge_samples)
-            sector = sector_of_objects(geo, s, int(float(even) * aimed))
-            if sector.rays > 0:
-                even = sector.rays
-            known = False
-            if kept_out.present != 0:
-                # As many even rays as before are the same rays: their numbers start by how many there are.
-                known = kept_out.point[i] == j and kept_out.count[i] == even
-                kept_out.point[i] = j
-                kept_out.count[i] = even
-            start = first_sample(even * pixel_points(points, j, edge_samples), even, stride, points, j)
-            for k in range(even + sector.rays):
-                disk = wp.vec2()
-                weight = sector.weight
-                if k < even:
-                    disk = concentric_disk(sobol2(seed, 0, start + k, 11))
-                    weight = ray_weight(sector, even, disk)
-                else:
-                    disk = sector_point(sector, sobol2(seed, 0, start + k - even, 12))
-                ray = ray_over(s, disk, weight)
-                if ray.up != 0:
-                    keeps = kept_out.present != 0 and k < even
-                    at = i * rays + k
-                    ray.real = kept_real(kept_out, keeps, keeps and known, at, geo, ray.origin, ray.direction)
-                    ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
-                    light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
-                    total = add_light(total, light, weight)
+            hits = Lambertian()
+            total = gather_at(i, j, points, geo, world, hits, rays, aimed, edge_samples, stride, seed, kept_out)
     before_out[i] = total.before
     after_out[i] = total.after
     nearness_out[i] = total.nearness
@@ -329,35 +368,7 @@ def _gather_rays_glossy(
     total = Gathered()
     if j >= 0:
         if points.role[j] != BACKGROUND:
-            s = load_surface(points, j)
-            even = share_of(rays, points, j, edge_samples)
-            sector = sector_of_objects(geo, s, int(float(even) * aimed))
-            if sector.rays > 0:
-                even = sector.rays
-            known = False
-            if kept_out.present != 0:
-                # As many even rays as before are the same rays: their numbers start by how many there are.
-                known = kept_out.point[i] == j and kept_out.count[i] == even
-                kept_out.point[i] = j
-                kept_out.count[i] = even
-            start = first_sample(even * pixel_points(points, j, edge_samples), even, stride, points, j)
-            for k in range(even + sector.rays):
-                disk = wp.vec2()
-                weight = sector.weight
-                if k < even:
-                    disk = concentric_disk(sobol2(seed, 0, start + k, 11))
-                    weight = ray_weight(sector, even, disk)
-                else:
-                    disk = sector_point(sector, sobol2(seed, 0, start + k - even, 12))
-                ray = ray_over(s, disk, weight)
-                if ray.up != 0:
-                    keeps = kept_out.present != 0 and k < even
-                    at = i * rays + k
-                    ray.real = kept_real(kept_out, keeps, keeps and known, at, geo, ray.origin, ray.direction)
-                    ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
-                    light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
-                    light = focused_incident(light, hits, geo, world, ray, start + k)
-                    total = add_light(total, light, weight)
+            total = gather_at(i, j, points, geo, world, hits, rays, aimed, edge_samples, stride, seed, kept_out)
     before_out[i] = total.before
     after_out[i] = total.after
     nearness_out[i] = total.nearness
