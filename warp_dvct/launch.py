@@ -253,13 +253,15 @@ def find_device(name: str) -> Any:
 def _launch_slabs(command: Any, waiting: deque[int], slab: int, count: int) -> float:
     """Replay a recorded launch for slabs until none is left; the processor seconds that took."""
     begun = time.thread_time()
+    command.set_param_at_index(0, 0)  # a number of its own: commands of other threads share the rest
     while True:
         try:
             start = waiting.popleft()
         except IndexError:
             return time.thread_time() - begun
-        command.set_param_at_index(0, start)
-        command.set_dim(min(slab, count - start))
+        command.set_param_at_index_from_ctype(0, start)
+        if start + slab > count:  # the last of all
+            command.set_dim(count - start)
         command.launch()
 
 
