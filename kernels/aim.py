@@ -7,7 +7,6 @@ balance heuristic (Veach & Guibas 1995), so that the sum stays right wherever th
 
 import warp as wp
 
-from warp_dvct.kernels.geometry import Geometry
 from warp_dvct.kernels.materials import Surface
 from warp_dvct.kernels.sampling import PI, tangent_of
 
@@ -19,28 +18,45 @@ NARROWEST = wp.constant(1.0e-4)  # of the disk's radius, in each direction: keep
 
 
 @wp.struct
-class Sector:
-    """Part of the unit disk under the hemisphere, on which cosine-distributed directions are uniform, and which of a
-    point's rays go into it."""
+class Targets:
+    """Boxes that together hold the synthetic triangles: their middles and half their edges."""
 
-    rays: wp.int32  # 0: none, and nothing else counts
+    count: wp.int32  # 0, 1 or 2
+    center: wp.vec3
+    extent: wp.vec3
+    other_center: wp.vec3
+    other_extent: wp.vec3
+
+
+@wp.struct
+class Sector:
+    """Part of the unit disk under the hemisphere, on which cosine-distributed directions are uniform."""
+
     middle: wp.vec2  # unit vector towards the middle
     half: wp.float32  # half the angle at the disk's centre
     sine: wp.float32  # of that
     inner: wp.float32  # squares of the radii between which it lies
     outer: wp.float32
-    share: wp.float32  # of the disk's area
-    weight: wp.float32  # of a ray within in the mean of all, where as many as go here are spread over the disk
+    share: wp.float32  # of the disk's area; 0 for no sector
+
+
+@wp.struct
+class Aim:
+    """Sectors that the targets take up, and how many of a point's rays go into them."""
+
+    rays: wp.int32  # 0: none, and nothing else counts
+    first: wp.int32  # of these go into the first sector, the others into the other
+    sector: Sector
+    other: Sector
+    density: wp.float32  # of rays in the first sector: how many to the disk's area
+    other_density: wp.float32
 
 
 @wp.func
-def sector_of_objects(geo: Geometry, s: Surface, rays: int) -> Sector:
-    """Where the box around the synthetic objects is over a surface's horizon; without rays where that is nowhere, or
-    too wide to be worth aiming at."""
+def sector_of_box(center: wp.vec3, extent: wp.vec3, s: Surface) -> Sector:
+    """Where a box is over a surface's horizon."""
     sector = Sector()
-    if rays <= 0 or geo.has_synthetic == 0:
-        return sector
-    toward = geo.center - s.position
+    toward = center - s.position
     t = tangent_of(s.normal)
     b = wp.cross(s.normal, t)
     sector.middle = wp.normalize(wp.vec2(wp.dot(toward, t), wp.dot(toward, b)))
@@ -52,9 +68,9 @@ def sector_of_objects(geo: Geometry, s: Surface, rays: int) -> Sector:
     right = float(0.0)
     for corner in range(8):
         way = toward + wp.vec3(
-            wp.where((corner & 1) == 0, -geo.extent[0], geo.extent[0]),
-            wp.where((corner & 2) == 0, -geo.extent[1], geo.extent[1]),
-            wp.where((corner & 4) == 0, -geo.extent[2], geo.extent[2]),
+            wp.where((corner & 1) == 0, -extent[0], extent[0]),
+            wp.where((corner & 2) == 0, -extent[1], extent[1]),
+            wp.where((corner & 4) == 0, -extent[2], extent[2]),
         )
         x = wp.dot(way, t)
         y = wp.dot(way, b)
@@ -79,19 +95,36 @@ def sector_of_objects(geo: Geometry, s: Surface, rays: int) -> Sector:
         # Between two corners the box comes nearer than either, at most to the middle of the chord.
         near = near * wp.cos(sector.half) * wp.cos(sector.half)
         sector.inner = wp.min(near / (near + high * high), sector.outer - NARROWEST)
+    sector.sine = wp.sin(sector.half)
     sector.share = (sector.outer - sector.inner) * sector.half / PI
-    if sector.share < WIDEST:
-        sector.rays = rays
-        sector.sine = wp.sin(sector.half)
-        sector.weight = 1.0 / (float(rays) * (1.0 + 1.0 / sector.share))
     return sector
+
+
+@wp.func
+def aim_at(targets: Targets, s: Surface, rays: int) -> Aim:
+    """``rays`` spread evenly over the targets' sectors; none where these are too wide to be worth aiming at."""
+    aim = Aim()
+    if rays <= 0 or targets.count == 0:
+        return aim
+    aim.sector = sector_of_box(targets.center, targets.extent, s)
+    if targets.count > 1:
+        aim.other = sector_of_box(targets.other_center, targets.other_extent, s)
+    share = aim.sector.share + aim.other.share
+    if share > 0.0 and share < WIDEST:
+        aim.rays = rays
+        aim.first = int(float(rays) * aim.sector.share / share + 0.5)
+        if aim.first > 0:
+            aim.density = float(aim.first) / aim.sector.share
+        if aim.first < rays:
+            aim.other_density = float(rays - aim.first) / aim.other.share
+    return aim
 
 
 @wp.func
 def in_sector(sector: Sector, disk: wp.vec2) -> bool:
     """Whether a point of the disk lies in the sector."""
     square = wp.length_sq(disk)
-    if sector.rays == 0 or square < sector.inner or square > sector.outer:
+    if square < sector.inner or square > sector.outer:
         return False
     if sector.half >= PI:
         return True
@@ -100,11 +133,17 @@ def in_sector(sector: Sector, disk: wp.vec2) -> bool:
 
 
 @wp.func
-def ray_weight(sector: Sector, even: int, disk: wp.vec2) -> float:
-    """Of one of ``even`` rays spread over the disk, beside as many in the sector: the balance heuristic."""
-    if in_sector(sector, disk):
-        return sector.weight
-    return 1.0 / float(even)
+def ray_weight(aim: Aim, even: int, disk: wp.vec2, drawn: int) -> float:
+    """Of a ray in the mean of ``even`` rays spread over the disk and the aimed ones: the balance heuristic.
+
+    ``drawn``: From the first sector (0), from the other (1) or from the disk (-1); rounding may put it beside its own.
+    """
+    density = float(even)
+    if aim.density > 0.0 and (drawn == 0 or in_sector(aim.sector, disk)):
+        density += aim.density
+    if aim.other_density > 0.0 and (drawn == 1 or in_sector(aim.other, disk)):
+        density += aim.other_density
+    return 1.0 / density
 
 
 @wp.func

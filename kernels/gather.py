@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_dvct.kernels.aim import ray_weight, sector_of_objects, sector_point
+from warp_dvct.kernels.aim import Targets, aim_at, ray_weight, sector_point
 from warp_dvct.kernels.cones import DUAL, OPAQUE, ConeSettings, march_cone
 from warp_dvct.kernels.environment import environment_radiance
 from warp_dvct.kernels.gbuffer import (
@@ -267,6 +267,7 @@ def gather_at(
     geo: Geometry,
     world: World,
     hits: Any,
+    targets: Targets,
     rays: int,
     aimed: float,
     edge_samples: int,
@@ -278,9 +279,9 @@ def gather_at(
     total = Gathered()
     s = load_surface(points, j)
     even = share_of(rays, points, j, edge_samples)
-    sector = sector_of_objects(geo, s, int(float(even) * aimed))
-    if sector.rays > 0:
-        even = sector.rays
+    aim = aim_at(targets, s, int(float(even) * aimed))
+    if aim.rays > 0:
+        even = aim.rays
     known = False
     if kept_out.present != 0:
         # As many even rays as before are the same rays: their numbers start by how many there are.
@@ -288,14 +289,16 @@ def gather_at(
         kept_out.point[i] = j
         kept_out.count[i] = even
     start = first_sample(even * pixel_points(points, j, edge_samples), even, stride, points, j)
-    for k in range(even + sector.rays):
+    for k in range(even + aim.rays):
         disk = wp.vec2()
-        weight = sector.weight
+        drawn = int(-1)
         if k < even:
             disk = concentric_disk(sobol2(seed, 0, start + k, 11))
-            weight = ray_weight(sector, even, disk)
         else:
-            disk = sector_point(sector, sobol2(seed, 0, start + k - even, 12))
+            xi = sobol2(seed, 0, start + k - even, 12)
+            drawn = wp.where(k - even < aim.first, 0, 1)
+            disk = sector_point(wp.where(drawn == 0, aim.sector, aim.other), xi)
+        weight = ray_weight(aim, even, disk, drawn)
         ray = ray_over(s, disk, weight)
         if ray.up != 0:
             keeps = kept_out.present != 0 and k < even
@@ -315,6 +318,7 @@ def _gather_rays(
     index_in: wp.array(dtype=wp.int32),
     geo: Geometry,
     world: World,
+    targets: Targets,
     rays: int,
     aimed: float,
     edge_samples: int,
@@ -338,7 +342,9 @@ def _gather_rays(
     if j >= 0:
         if points.role[j] != BACKGROUND:
             hits = Lambertian()
-            total = gather_at(i, j, points, geo, world, hits, rays, aimed, edge_samples, stride, seed, kept_out)
+            total = gather_at(
+                i, j, points, geo, world, hits, targets, rays, aimed, edge_samples, stride, seed, kept_out
+            )
     before_out[i] = total.before
     after_out[i] = total.after
     nearness_out[i] = total.nearness
@@ -352,6 +358,7 @@ def _gather_rays_glossy(
     geo: Geometry,
     world: World,
     hits: GlossyHits,
+    targets: Targets,
     rays: int,
     aimed: float,
     edge_samples: int,
@@ -368,7 +375,9 @@ def _gather_rays_glossy(
     total = Gathered()
     if j >= 0:
         if points.role[j] != BACKGROUND:
-            total = gather_at(i, j, points, geo, world, hits, rays, aimed, edge_samples, stride, seed, kept_out)
+            total = gather_at(
+                i, j, points, geo, world, hits, targets, rays, aimed, edge_samples, stride, seed, kept_out
+            )
     before_out[i] = total.before
     after_out[i] = total.after
     nearness_out[i] = total.nearness

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_dvct.kernels.aim import sector_of_objects
+from warp_dvct.kernels.aim import Targets, aim_at
 from warp_dvct.kernels.gbuffer import BACKGROUND, Points, load_surface
 from warp_dvct.kernels.geometry import FAR, Geometry, trace_real, trace_synthetic
 from warp_dvct.kernels.materials import spawn_point
@@ -31,6 +31,7 @@ def _look_around(
     points: Points,
     index_in: wp.array(dtype=wp.int32),
     geo: Geometry,
+    targets: Targets,
     low: wp.vec3,
     high: wp.vec3,
     rays: int,
@@ -68,4 +69,4 @@ def _look_around(
     met_out[i] = met
     entered_out[i] = entered
     nearness_out[i] = nearness / float(rays)
-    aimed_out[i] = sector_of_objects(geo, s, 1).rays
+    aimed_out[i] = aim_at(targets, s, 1).rays

@@ -20,6 +20,7 @@ from warp_dvct.kernels.materials import Materials
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.sidedness import lit_from_behind
 from warp_dvct.scene import Camera, Light, LightKind, Material, Mesh, Role, Scene, Texture
+from warp_dvct.targets import targets_of
 
 # A closed mesh may be met from behind by the odd ray that slips through an edge; this many are no accident.
 BACKS_MET = 4
@@ -33,6 +34,7 @@ class DeviceScene:
     Attributes:
         geometry, materials, lights, camera: Kernel structs, in volume space.
         real, synthetic: The acceleration structures (``wp.Mesh``); None where there are no such triangles.
+        targets: Where the synthetic triangles are (``kernels.aim.Targets``), see :func:`warp_dvct.targets.targets_of`.
         triangles_vs: Host float32 ``[t, 3, 3]``, corners in volume space; real triangles first, then synthetic ones.
         role, material: Host int32 ``[t]``.
         double_sided: Host int32 ``[t]``: 1 where the stage says so, or where light meets the mesh from behind and goes
@@ -48,6 +50,7 @@ class DeviceScene:
     camera: Any
     real: Any
     synthetic: Any
+    targets: Any
     triangles_vs: np.ndarray
     role: np.ndarray
     double_sided: np.ndarray
@@ -90,6 +93,7 @@ class DeviceScene:
             camera=camera_frame(scene.camera, origin, scale),
             real=real,
             synthetic=synthetic,
+            targets=targets_of(_synthetic_boxes(host) if synthetic is not None else np.zeros((0, 2, 3))),
             triangles_vs=host.triangles,
             role=host.role,
             double_sided=double_sided,
@@ -202,6 +206,14 @@ def _upload_geometry(launcher: Launcher, host: _HostTriangles, real: Any, synthe
     geometry.material = launcher.array(host.material, wp.int32)
     geometry.double_sided = launcher.array(host.double_sided, wp.int32)
     return geometry
+
+
+def _synthetic_boxes(host: _HostTriangles) -> np.ndarray:
+    """Low and high corners of each synthetic mesh, ``[m, 2, 3]``."""
+    corners, mesh = host.triangles[host.synthetic_first :], host.mesh[host.synthetic_first :]
+    starts = np.flatnonzero(np.diff(mesh, prepend=-1))
+    low, high = np.minimum.reduceat(corners.min(1), starts), np.maximum.reduceat(corners.max(1), starts)
+    return np.stack([low, high], 1)
 
 
 def _material_f0(material: Material) -> tuple[float, float, float]:

@@ -259,7 +259,7 @@ def _around(
     low, high = ((b - np.asarray(plan.origin)) * plan.scale for b in bounds) if bounds else (np.ones(3), np.zeros(3))
     met, entered, aimed = (launcher.empty(count, wp.int32) for _ in range(3))
     nearness = launcher.empty(count, wp.float32)
-    inputs = [buffer.points, index, device_scene.geometry, wp.vec3(*low), wp.vec3(*high), RAYS, 0]
+    inputs = [buffer.points, index, device_scene.geometry, device_scene.targets, wp.vec3(*low), wp.vec3(*high), RAYS, 0]
     launcher.launch(kernels._look_around, count, inputs, [met, entered, nearness, aimed])
     found = met.numpy().astype(np.float64)
     missing = found < 0

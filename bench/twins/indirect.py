@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_dvct.bench.twins.aim import Sectors
+from warp_dvct.bench.twins.aim import Aims
 from warp_dvct.bench.twins.deviation import Deviation, compare
 from warp_dvct.bench.twins.numbers import (
     concentric_disk,
@@ -30,6 +30,7 @@ from warp_dvct.kernels.radiosity import World
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.gather import Gatherer
 from warp_dvct.passes.gbuffer import new_points
+from warp_dvct.targets import make_targets
 
 COUNT = 64
 CONES, RAYS = 9, 16
@@ -187,29 +188,33 @@ def radiosity(field: np.ndarray, place: np.ndarray, normal: np.ndarray, footprin
 
 
 def measure_rays(launcher: Any) -> list[Deviation]:
-    """Rays that read the voxels they hit, before and after: cosine-distributed, and partly aimed at the objects."""
-    return _gathered(launcher, 0.0, "") + _gathered(launcher, 0.25, ", aimed")
+    """Rays that read the voxels they hit, before and after: cosine-distributed, and partly aimed at one box or two."""
+    found = _gathered(launcher, 0.0, "") + _gathered(launcher, 0.25, ", aimed")
+    return found + _gathered(launcher, 0.25, ", aimed at two", halves=True)
 
 
-def _gathered(launcher: Any, aimed: float, what: str) -> list[Deviation]:
+def _gathered(launcher: Any, aimed: float, what: str, *, halves: bool = False) -> list[Deviation]:
+    """``halves``: The object's box is taken for two, a low one and a high one that overlap."""
     twin, voxels, _, _ = lit(launcher)
+    if halves:
+        low, high = (np.array([*v], float) for v in (twin.device.targets.center, twin.device.targets.extent))
+        parts = np.array([[low - high, low + high * (1, 0.2, 1)], [low - high * (0.5, 0.1, 0.5), low + high]])
+        twin = replace(twin, device=replace(twin.device, targets=make_targets(parts)))
     points, position, normal, triangle = places(launcher, twin)
     gatherer = Gatherer(twin.device, world_of(launcher, twin, voxels.volume), RAYS, 0, aimed=aimed)
     index = launcher.array(np.arange(COUNT, dtype=np.int32), wp.int32)
     got = gatherer.run(launcher, points, index, COUNT)
 
     field = fields(voxels)[0]
-    sectors = Sectors.of(twin, position, normal)
     few = round(RAYS * aimed)
-    plain = ~sectors.aimed | (few == 0)
+    aims = Aims.of(twin, position, normal, few)
     total = np.zeros((COUNT, 2, 3))
     for k in range(RAYS):
         disk = np.broadcast_to(concentric_disk(sobol2(0, 0, k, 11)), (COUNT, 2))
-        total += weighted(twin, (position, normal, triangle), disk, plain / RAYS, field)
+        total += weighted(twin, (position, normal, triangle), disk, ~aims.aimed / RAYS, field)
     for k in range(few):
-        for disk in (concentric_disk(sobol2(0, 0, k, 11)) + np.zeros((COUNT, 1)), sectors.point(sobol2(0, 0, k, 12))):
-            density = few * (1.0 + sectors.contain(disk) / sectors.share)
-            total += weighted(twin, (position, normal, triangle), disk, ~plain / density, field)
+        for disk in (concentric_disk(sobol2(0, 0, k, 11)) + np.zeros((COUNT, 1)), aims.draw(k, sobol2(0, 0, k, 12))):
+            total += weighted(twin, (position, normal, triangle), disk, aims.aimed / (few + aims.density(disk)), field)
     kernel = gather._gather_rays
     return [compare(kernel, name + what, got[s].numpy(), total[:, s]) for s, name in enumerate(("before", "after"))]
 

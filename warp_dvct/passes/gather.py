@@ -67,7 +67,15 @@ class Gatherer:
             how = [self.cones, self.cone, int(self.with_before), self.seed]
             launcher.launch(kernels._gather_cones, count, [*shared, *how], [before, after])
             return before, after
-        how = [self.rays, self.aimed, self.edge_samples, stride, self.seed, kept or keep_rays(launcher, 0, 0)]
+        how = [
+            self.scene.targets,
+            self.rays,
+            self.aimed,
+            self.edge_samples,
+            stride,
+            self.seed,
+            kept or keep_rays(launcher, 0, 0),
+        ]
         if self.hits is None:
             launcher.launch(kernels._gather_rays, count, [*shared, *how], [before, after, nearness])
         else:
