@@ -54,7 +54,8 @@ class Flicker:
 
     Attributes:
         frames: Consecutive frames. size: Pixels. truth_samples: Per pixel of the truth.
-        truth_noise: LDR-FLIP that the truth's own noise is worth in a single frame; it is in all the figures.
+        truth_noise: What the truth's own noise flickers by: half of its two halves' flicker beside each other. It is in
+            ``ours`` and ``peer``, of which :meth:`net` takes it out.
         ours, peer: Of the method, and of the path tracer at 4 samples a pixel.
         peer_name: What the peer is, with or without a denoiser.
         ours_error, peer_error: Mean LDR-FLIP of the single frames.
@@ -69,6 +70,10 @@ class Flicker:
     peer_name: str
     ours_error: float
     peer_error: float
+
+    def net(self, flicker: float) -> float:
+        """Without the truth's noise: independent errors add up as squares."""
+        return math.sqrt(max(flicker**2 - self.truth_noise**2, 0.0))
 
 
 @dataclass(frozen=True)
@@ -213,24 +218,32 @@ def _flicker(scenes: Sequence[Scene], options: MotionOptions) -> Flicker:
     launcher = Launcher(options.device, options.threads)
     width = options.flicker_width
     height = max(1, round(width / scenes[0].camera.aspect))
-    truths = [
-        ReferenceStore(
-            s, width, height, samples=options.samples, seed=1, cache=options.cache, launcher=launcher, quiet=True
-        ).get(MANY_BOUNCES)
-        for s in scenes
+    # Two halves by other random numbers, for what the truth's own noise flickers by to be known.
+    halves = [
+        [
+            ReferenceStore(
+                scene, width, height, samples=half, seed=seed, cache=options.cache, launcher=launcher, quiet=True
+            ).get(MANY_BOUNCES)
+            for scene in scenes
+        ]
+        for seed, half in ((1, -(-options.samples // 2)), (2, max(1, options.samples // 2)))
     ]
+    # Every method is given the truth's 'before' as the plate: only what it changes is compared.
+    plates = [0.5 * (one.before + two.before) for one, two in zip(*halves, strict=True)]
+    if not options.light:
+        plates = [plates[0]] * len(scenes)
+    parts = [
+        [t.comp - (1.0 - t.coverage[..., None]) * (t.before - p) for t, p in zip(half, plates, strict=True)]
+        for half in halves
+    ]
+    expected = [0.5 * (one + two) for one, two in zip(*parts, strict=True)]
     ours_relighter = _relighter(scenes[0], options, width)
     denoise = _denoiser()
     ours, peer = [], []
-    for n, (scene, truth) in enumerate(zip(scenes, truths, strict=True)):
+    for n, (scene, plate) in enumerate(zip(scenes, plates, strict=True)):
         ours_relighter.set_scene(scene)
-        # Every method is given the truth's 'before' as the plate: only what it changes is compared.
-        plate = truth.before if options.light else truths[0].before
         ours.append(ours_relighter.render(plate).comp)
         peer.append(_path_traced(scene, plate, n, options, denoise))
-    expected = [t.comp for t in truths]
-    if not options.light:
-        expected = [t.comp - (1.0 - t.coverage[..., None]) * (t.before - truths[0].before) for t in truths]
     name = f"path tracer, {PEER_SAMPLES} spp" + (
         ", denoised by OIDN" if denoise else ", not denoised (pip install pyoidn)"
     )
@@ -238,7 +251,7 @@ def _flicker(scenes: Sequence[Scene], options: MotionOptions) -> Flicker:
         len(scenes),
         (width, height),
         options.samples,
-        _mean(t.noise for t in truths),
+        0.5 * flicker_of(*parts),
         flicker_of(ours, expected),
         flicker_of(peer, expected),
         name,
@@ -315,11 +328,11 @@ def format_report(report: MotionReport) -> str:
     ]
     if report.flicker is not None:
         f = report.flicker
-        least = max(f.peer, 1e-9)
+        ours, peer = f.net(f.ours), f.net(f.peer)
         lines.append(
-            f"flicker over {f.frames} frames at {f.size[0]}x{f.size[1]} (truth of {f.truth_samples} spp,"
-            f" its noise {f.truth_noise:.4f}): ours"
-            f" {f.ours:.4f}, {f.peer_name} {f.peer:.4f}, ratio {f.ours / least:.2f};"
+            f"flicker over {f.frames} frames at {f.size[0]}x{f.size[1]}, truth of {f.truth_samples} spp: ours"
+            f" {f.ours:.4f}, {f.peer_name} {f.peer:.4f}, ratio {f.ours / max(f.peer, 1e-9):.3f};"
+            f" without the truth's own {f.truth_noise:.4f}: {ours:.4f}, {peer:.4f}, ratio {ours / max(peer, 1e-9):.3f};"
             f" FLIP of the single frames {f.ours_error:.4f} and {f.peer_error:.4f}"
         )
     return "\n".join(lines)
