@@ -38,6 +38,8 @@ from warp_dvct.kernels.sampling import INV_PI, PI, concentric_disk, from_frame, 
 
 wp.set_module_options({"enable_backward": False})
 
+RUN = 32  # points
+
 
 @wp.func
 def hit_incident(
@@ -311,6 +313,14 @@ def gather_at(
     return total
 
 
+@wp.func
+def of_turn(i: int, number: int, of: int) -> int:
+    """The ``i``-th element of a turn. It takes one of ``of`` runs of neighbours, whose rays meet the same surfaces, and
+    another one of the next ``of``: else it might hold one side of the picture."""
+    group = i / RUN
+    return (group * of + (number + group) % of) * RUN + i % RUN
+
+
 @wp.kernel
 def _gather_rays(
     first: int,
@@ -319,6 +329,7 @@ def _gather_rays(
     geo: Geometry,
     world: World,
     targets: Targets,
+    turn: wp.vec3i,
     rays: int,
     aimed: float,
     edge_samples: int,
@@ -332,11 +343,13 @@ def _gather_rays(
     """Irradiance [W m^-2] from indirect light and domes, by exact rays (eq. 6's integral).
 
     They are cosine-distributed, and fewer but partly aimed at the synthetic objects where ``aimed`` is above 0 and
-    these take up little of the view (``kernels.aim``). ``stride`` is the spacing of the gathered points in pixels; a
-    pixel's ``edge_samples`` points share its rays out. ``nearness_out`` is the mean inverse distance of what the rays
-    met.
+    these take up little of the view (``kernels.aim``). ``turn`` has its number, how many there are, and how many points
+    in all of them. ``stride`` is the spacing of the gathered points in pixels; a pixel's ``edge_samples`` points share
+    its rays out. ``nearness_out`` is the mean inverse distance of what the rays met.
     """
-    i = first + wp.tid()
+    i = of_turn(first + wp.tid(), turn[0], turn[1])
+    if i >= turn[2]:
+        return
     j = index_in[i]
     total = Gathered()
     if j >= 0:
@@ -359,6 +372,7 @@ def _gather_rays_glossy(
     world: World,
     hits: GlossyHits,
     targets: Targets,
+    turn: wp.vec3i,
     rays: int,
     aimed: float,
     edge_samples: int,
@@ -370,7 +384,9 @@ def _gather_rays_glossy(
     nearness_out: wp.array(dtype=wp.float32),
 ):
     """As ``_gather_rays``, where what rays meet may be glossy: apart, because it takes three times the registers."""
-    i = first + wp.tid()
+    i = of_turn(first + wp.tid(), turn[0], turn[1])
+    if i >= turn[2]:
+        return
     j = index_in[i]
     total = Gathered()
     if j >= 0:

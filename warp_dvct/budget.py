@@ -32,10 +32,11 @@ from warp_dvct.cost import CHOOSING, count_survey, count_work
 from warp_dvct.cost_model import CostModel, Counts, price
 from warp_dvct.cost_vpls import count_vpl_work
 from warp_dvct.errors import OptionError
-from warp_dvct.pace import RAYS_SET, Pace
+from warp_dvct.pace import Pace
 from warp_dvct.passes.gather import FINEST
 from warp_dvct.settings import NAMES, QUALITIES, Settings, make_settings
 from warp_dvct.survey import Survey
+from warp_dvct.turns import RAYS_SET
 
 AIM = 0.95  # of the budget, for the settings' prediction; what is left when rays are settled goes into them
 VOXELS_PER_FEATURE = 2.0  # across the smallest extent of an object, for its light not to pass through it
@@ -81,7 +82,9 @@ class Choice:
         head = f"predicted: {self.seconds:.2f} s ({self.cpu_seconds:.2f} s of processor time), {error}"
         lines = [head, *(f"  {line}" for line in self.reasons)]
         if self.pace is not None:
-            lines.append("  gather.rays is settled once the volumes are lit, by the time that is left then")
+            lines.append(
+                "  gather.rays is settled while the frame is gathered, again and again, by the time that is left"
+            )
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:

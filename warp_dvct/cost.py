@@ -13,6 +13,7 @@ from functools import lru_cache
 from warp_dvct.cost_cones import by_cones, gathered_by_cones, glossy_cones, shadow_cones
 from warp_dvct.cost_model import Counts
 from warp_dvct.gather_need import GatherNeed
+from warp_dvct.passes.gather import GATHER_PARTS, HIDDEN, HIDDEN_FEWER, OBJECT_PARTS, REAL_PARTS
 from warp_dvct.pilot import VolumeNeed
 from warp_dvct.settings import Settings
 from warp_dvct.survey import MapNeed, PointNeed, Survey
@@ -191,49 +192,52 @@ def _specular(settings: Settings, survey: Survey, pixels: float, edges: float) -
 def _gather_by_cones(settings: Settings, survey: Survey, width: int, height: int, edges: float) -> Counts:
     """Cones of all gathered points; no detail is halved."""
     plain = replace(settings, gather_detail=0.0)
-    first, again, objects = (1e-6 * n for n in gathered_points(plain, survey, width, height))
+    points = gather_points(plain, survey, width, height)
+    objects = sum(points[part] for part in OBJECT_PARTS)
+    real = sum(points.values()) - objects
     pixels = width * height * 1e-6
-    hidden = 0.0 if survey.plate else survey.object * pixels + survey.edge.object * edges
-    counts = gathered_by_cones(settings, survey, first + again + hidden, objects)
+    counts = gathered_by_cones(settings, survey, 1e-6 * real, 1e-6 * objects)
     return {"frame": 1, "points by cones": pixels + edges, **counts}
 
 
 def _gather(settings: Settings, survey: Survey, width: int, height: int, edges: float) -> Counts:
     """Rays of all gathered points, and what is done with them."""
-    real, on_object = survey.on_real, survey.on_object
-    first, again, objects = gathered_points(settings, survey, width, height)
-    counts = gathered_on_real(settings, survey, first, real.entered, real.aimed)
-    _add(counts, gathered_on_real(settings, survey, again, real.entered_again, real.aimed_again))
-    _add(counts, gathered(survey, on_object, objects, settings.gather_object_rays))
     pixels = width * height * 1e-6
-    if not survey.plate:
-        # Real surfaces behind the objects are gathered point by point, with a quarter of the rays.
-        hidden = 1e6 * (survey.object * pixels + survey.edge.object * edges)
-        _add(counts, gathered(survey, real, hidden, max(1, settings.gather_rays // 4), entered=real.entered_again))
     blocks = pixels / settings.gather_stride**2 + pixels / settings.gather_object_stride**2
-    return {"frame": 1, "points": pixels + edges, "blocks": blocks, **counts}
-
-
-def gathered_on_real(settings: Settings, survey: Survey, points: float, entered: float, aimed: float) -> Counts:
-    """As :func:`gathered`, on real surfaces; a share ``aimed`` of the points sends fewer rays, half at the objects."""
-    few = int(settings.gather_rays * settings.gather_aimed) if survey.plate else 0
-    far = points * aimed if few > 0 else 0.0
-    counts = gathered(survey, survey.on_real, points - far, settings.gather_rays, entered=entered)
-    _add(counts, gathered(survey, survey.on_real, far, 2 * few, entered=0.5 + 0.5 * entered))
+    counts = {"frame": 1, "points": pixels + edges, "blocks": blocks, **gathered(survey, survey.on_real, 0.0, 1)}
+    for part, points in gather_points(settings, survey, width, height).items():
+        for unit, count in gather_part(settings, survey, part, points).items():
+            counts[unit] += count
     return counts
 
 
-def gathered_points(settings: Settings, survey: Survey, width: int, height: int) -> tuple[float, float, float]:
-    """How many points are gathered: on real surfaces one of each block, on them at halved strides or by themselves,
-    and on objects."""
+def gather_points(settings: Settings, survey: Survey, width: int, height: int) -> dict[str, float]:
+    """How many points are gathered by ``GATHER_PARTS``, in the order of the gather."""
     pixels, edges = float(width * height), settings.antialias * survey.outline * width
     detail, on_edges = settings.gather_detail, survey.edge.object * edges
     first, again, alone, at_edges = _points(survey.on_real.need, settings.gather_stride, width, height, detail)
-    again += alone * survey.real * pixels + at_edges * (edges - on_edges)
-    objects, more, alone, at_edges = _points(
-        survey.on_object.need, settings.gather_object_stride, width, height, detail
-    )
-    return first, again, objects + more + alone * survey.object * pixels + at_edges * on_edges
+    real = first, again, alone * survey.real * pixels + at_edges * (edges - on_edges)
+    first, again, alone, at_edges = _points(survey.on_object.need, settings.gather_object_stride, width, height, detail)
+    objects = first, again, alone * survey.object * pixels + at_edges * on_edges
+    hidden = 0.0 if survey.plate else survey.object * pixels + on_edges
+    return dict(zip(GATHER_PARTS, (*objects, *real, hidden), strict=True))
+
+
+def gather_part(settings: Settings, survey: Survey, part: str, points: float) -> Counts:
+    """Rays of ``points`` of one of ``GATHER_PARTS``, by what they cost."""
+    real = survey.on_real
+    if part == HIDDEN:
+        return gathered(survey, real, points, max(1, settings.gather_rays // HIDDEN_FEWER), entered=real.entered_again)
+    if part not in REAL_PARTS:
+        return gathered(survey, survey.on_object, points, settings.gather_object_rays)
+    first = part == REAL_PARTS[0]
+    entered, aimed = (real.entered, real.aimed) if first else (real.entered_again, real.aimed_again)
+    # A share of the points sends fewer rays, half at the objects.
+    few = int(settings.gather_rays * settings.gather_aimed) if survey.plate else 0
+    far = points * aimed if few > 0 else 0.0
+    counts = gathered(survey, real, points - far, settings.gather_rays, entered=entered)
+    aimed_counts = gathered(survey, real, far, 2 * few, entered=0.5 + 0.5 * entered)
+    return {unit: count + aimed_counts[unit] for unit, count in counts.items()}
 
 
 def gathered(survey: Survey, where: PointNeed, points: float, rays: int, *, entered: float | None = None) -> Counts:
@@ -252,11 +256,6 @@ def gathered(survey: Survey, where: PointNeed, points: float, rays: int, *, ente
         "synthetic deep": traced * entered * math.log2(2.0 + survey.synthetic_triangles),
         "focused": traced * float(survey.focuses),
     }
-
-
-def _add(counts: Counts, more: Counts) -> None:
-    for unit, count in more.items():
-        counts[unit] += count
 
 
 @lru_cache(maxsize=512)

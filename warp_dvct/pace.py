@@ -1,7 +1,8 @@
 """Keeping a budget while it is spent: how many rays a point gathers is settled when the light is in the volumes.
 
 By then the frame has shown how fast the machine is just now, and a few points gathered on trial show what rays take in
-this scene. What is left of the time decides. All other settings follow from the scene and the budget alone.
+this scene. What is left of the time decides, again and again while they are gathered (:mod:`warp_dvct.turns`). All
+other settings follow from the scene and the budget alone.
 """
 
 from __future__ import annotations
@@ -14,16 +15,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warp_dvct.cost import REST, gathered, gathered_on_real, gathered_points
+from warp_dvct.cost import REST, gather_part, gather_points
 from warp_dvct.cost_model import Counts, price
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels import probe
+from warp_dvct.kernels.gather import RUN
 from warp_dvct.launch import Launcher
-from warp_dvct.passes.gather import Gatherer, glossy_hits
+from warp_dvct.passes.gather import HIDDEN, OBJECT_PARTS, REAL_PARTS, Gatherer, glossy_hits
 from warp_dvct.passes.gbuffer import render_gbuffer
 from warp_dvct.scene import Role, Scene
-from warp_dvct.settings import NAMES, Settings
+from warp_dvct.settings import Settings
 from warp_dvct.survey import Survey
+from warp_dvct.turns import SLOWNESS, GatherTurns, with_rays
 
 if TYPE_CHECKING:
     from warp_dvct.methods.delta_cone_tracing import LightField
@@ -33,14 +36,12 @@ TRIALS = 3  # of which the median counts: another process may hold a thread up i
 LEAST_TRIAL = 2e-3  # seconds of each: the clock and the threads' start do not show in it
 TRIAL_SHARE = 0.01  # of what is left, for all trials
 LEAST_POINTS = 128  # of a trial: every thread has several
-RUN = 32  # of neighbours: their rays meet the same surfaces, so the processor's caches hold what they read
 MOST_TRIED = 128  # rays a point of a trial: more take in proportion
 PROBE = 4096, 200  # elements and steps of the machine's trial: 5 ms on one thread
-SLOWNESS = (0.4, 4.0)  # measured over predicted seconds that are believed
-RAYS_SET = ("gather.rays", "gather.object_rays")  # what is settled
 BELIEVED = 0.75  # of the logarithm of a slow machine's sudden speed
 BUSY = 0.9  # of the largest gain by threads: passes with less leave threads idle
-LATER = ("direct", "specular", "resolve", "composite", "gbuffer", REST)  # passes that do not run before
+LAST = ("specular", "resolve", "composite", REST)  # passes after the gather
+LATER = ("gbuffer", "direct", *LAST)  # passes that do not run before the volumes are lit
 
 
 def try_machine(launcher: Launcher) -> float:
@@ -61,14 +62,16 @@ class Settled:
     """What was settled.
 
     Attributes:
-        rays: Of a point. planned: Of a point, when the settings were chosen.
-        slowness: Measured over predicted seconds of the passes until then. ray_slowness: Of gathered rays.
+        rays: Of a point, the mean of all turns. planned: Of a point, when the settings were chosen.
+        slowness: Measured over predicted seconds of the passes until then. ray_slowness: Of rays gathered on trial.
+        turns: Rays of a point, turn by turn; with those that were planned.
     """
 
     rays: int
     planned: int
     slowness: float
     ray_slowness: float
+    turns: tuple[int, ...]
 
 
 @dataclass
@@ -84,7 +87,7 @@ class Pace:
         count: From settings to counts by pass of a frame.
         least, most: Rays of a point.
         slowness: By which ``units`` were made dearer, see ``planning``. spent: Seconds of the planning.
-        settled: Once the first frame was rendered.
+        settled: Once the first frame's volumes were lit; its rays once the frame was rendered.
     """
 
     survey: Survey
@@ -107,28 +110,45 @@ class Pace:
 
     def settle(
         self, launcher: Launcher, scene: Scene, device_scene: DeviceScene, lit: LightField, settings: Settings
-    ) -> Settings:
-        """Settings with as many rays as fit what is left, called when all but the camera's passes are done."""
+    ) -> GatherTurns:
+        """Turns of the gather that fill what is left, called when all but the camera's passes are done."""
         wp.synchronize_device(launcher.device)
         work = self.count(settings)
         done = {name: work[name] for name in launcher.pass_seconds if name in work and name not in (*LATER, "gather")}
         predicted = price(done, self.units)
         measured = sum(launcher.pass_seconds[name] for name in done)
         slowness = self._believed(measured / predicted if predicted > 0.0 else 1.0)
-        later = slowness * price({name: work[name] for name in LATER if name in work}, self.units)
-        left = self._left(launcher) - later
+        later = {
+            names: slowness * price({name: work[name] for name in names if name in work}, self.units)
+            for names in (LATER, LAST)
+        }
+        left = self._left(launcher) - later[LATER]
         tried = self._try_rays(launcher, scene, device_scene, lit, settings, left)
         ray_slowness = self._believed(tried * self._stall(launcher, done) / self.slowness)
-        left = self._left(launcher) - later
-        low, high = self.least, self.most
-        while low < high:
-            middle = (low + high + 1) // 2
-            if ray_slowness * self._gather_seconds(with_rays(settings, middle)) <= left:
-                low = middle
-            else:
-                high = middle - 1
-        self.settled = Settled(low, settings.gather_rays, slowness, ray_slowness)
-        return with_rays(settings, low)
+        apart = price({"gather": work["gather"]}, self.units) - sum(
+            price({"gather": gather_part(settings, self.survey, part, points)}, self.units)
+            for part, points in gather_points(settings, self.survey, self.width, self.height).items()
+        )
+        self.settled = Settled(settings.gather_rays, settings.gather_rays, slowness, ray_slowness, ())
+        return GatherTurns(
+            self.survey,
+            self.width,
+            self.height,
+            self.units,
+            left=lambda: self._left(launcher),
+            later=later[LAST] + slowness * apart,
+            slowness=ray_slowness,
+            least=self.least,
+            most=self.most,
+            settings=settings,
+        )
+
+    def end(self, turns: GatherTurns) -> Settings:
+        """Settings of the same time and noise as the turns, once they are over: with their mean rays."""
+        rays = turns.mean_rays
+        assert self.settled is not None
+        self.settled = replace(self.settled, rays=rays, turns=tuple(n for _, n in turns.taken))
+        return with_rays(turns.settings, rays)
 
     def _believed(self, slowness: float) -> float:
         """Measured over predicted seconds, within bounds. A machine that was slow when the plan was made, and no longer
@@ -156,9 +176,6 @@ class Pace:
         began, compiled = self._began
         return self.aim - self.spent - (time.perf_counter() - began - (launcher.compile_seconds - compiled))
 
-    def _gather_seconds(self, settings: Settings) -> float:
-        return price({"gather": self.count(settings)["gather"]}, self.units)
-
     def _try_rays(
         self,
         launcher: Launcher,
@@ -177,8 +194,9 @@ class Pace:
         buffer = render_gbuffer(launcher, device_scene, WIDTH, height, edge_samples=0, behind=False)
         role = buffer.points.role.numpy()[: WIDTH * height]
         found = [np.flatnonzero(role == int(r)) for r in (Role.REAL, Role.SYNTHETIC)]
-        first, again, objects = gathered_points(settings, self.survey, self.width, self.height)
-        share = objects / max(first + again + objects, 1.0)
+        numbers = gather_points(settings, self.survey, self.width, self.height)
+        objects = sum(numbers[part] for part in OBJECT_PARTS)
+        share = objects / max(sum(numbers.values()) - numbers[HIDDEN], 1.0)
         few = with_rays(settings, rays)
         one = self._trial_seconds(few, 1.0 - share, share)
         wanted = launcher.threads * max(LEAST_TRIAL, TRIAL_SHARE * left / TRIALS) / max(one, 1e-9)
@@ -201,11 +219,8 @@ class Pace:
 
     def _trial_seconds(self, settings: Settings, real: float, objects: float) -> float:
         """Predicted processor time of the rays of some points on real surfaces and on objects."""
-        on_real, on_object = self.survey.on_real, self.survey.on_object
-        counts = [
-            gathered_on_real(settings, self.survey, real, on_real.entered, on_real.aimed),
-            gathered(self.survey, on_object, objects, settings.gather_object_rays),
-        ]
+        points = {REAL_PARTS[0]: real, OBJECT_PARTS[0]: objects}
+        counts = [gather_part(settings, self.survey, part, n) for part, n in points.items()]
         return sum(price({"gather": each}, self.cpu_units) for each in counts)
 
 
@@ -216,8 +231,3 @@ def _spread(pixels: np.ndarray, count: int, trial: int) -> np.ndarray:
         return pixels[:count]
     starts = (np.arange(runs) + trial / TRIALS) * (len(pixels) / runs)
     return pixels[np.minimum(starts.astype(int), len(pixels) - RUN)[:, None] + np.arange(RUN)].ravel()
-
-
-def with_rays(settings: Settings, rays: int) -> Settings:
-    """``settings`` with as many gathered rays of every point."""
-    return replace(settings, **{NAMES[name]: rays for name in RAYS_SET})

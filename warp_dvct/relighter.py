@@ -147,7 +147,7 @@ class Relighter:
         """Choose the settings for a time, or for an error, from now on; those given by name stay as they are.
 
         Under a time the next frame settles how many rays are gathered, by the time that is left then; later frames
-        keep that number.
+        keep the mean number of its points.
 
         Args:
             seconds: For one frame from scratch on this machine, without loading and compiling.
@@ -297,15 +297,17 @@ class Relighter:
             delta_cone_tracing.LightField,
             lambda uploaded: delta_cone_tracing.light_volumes(launcher, scene, uploaded, plan, self._kept),
         )
-        if self._pace is not None:
+        turns, pace = None, self._pace
+        if pace is not None:
             with launcher.scope("settle"):
-                self.settings = self._pace.settle(launcher, scene, device_scene, light_field, self.settings)
-                self._plan(has_plate=not with_before)
-            self._pace, plan = None, self.plan
+                turns = pace.settle(launcher, scene, device_scene, light_field, self.settings)
         report("shading", 0.5)
         radiance = delta_cone_tracing.render(
-            launcher, scene, device_scene, light_field, plan, with_before=with_before, kept=self._kept
+            launcher, scene, device_scene, light_field, plan, with_before=with_before, kept=self._kept, turns=turns
         )
+        if pace is not None and turns is not None:
+            self._pace, self.settings = None, pace.end(turns)
+            self._plan(has_plate=not with_before)
         return self._through_lens(radiance)
 
     def _instant_radiosity(self, plate: np.ndarray | None, ldr: bool, report: Progress) -> Radiance:

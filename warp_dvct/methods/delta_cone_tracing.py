@@ -25,7 +25,9 @@ from warp_dvct.layers import Radiance
 from warp_dvct.passes.bounces import mean_albedo, reinject, solve_bounces
 from warp_dvct.passes.environment import build_environment
 from warp_dvct.passes.gather import (
+    HIDDEN_FEWER,
     Gatherer,
+    Turns,
     focusing_materials,
     gather_all,
     gather_sparse,
@@ -110,12 +112,14 @@ def render(
     *,
     with_before: bool,
     kept: Kept | None = None,
+    turns: Turns | None = None,
 ) -> Radiance:
     """Shade what the camera sees (Franke 2014, section 3.3): direct, indirect diffuse, indirect specular, resolve.
 
     Args:
         with_before: Also render the real scene alone, to serve as the plate.
         kept: Holds what the real scene and the camera alone decide from frame to frame.
+        turns: Decide how many rays are gathered instead of the plan's settings.
     """
     settings, world = plan.settings, light_field.world
     with launcher.scope("gbuffer"):
@@ -153,7 +157,7 @@ def render(
                 _shade_direct(launcher, device_scene, plan, world, part)
             if _has_indirect(scene, plan):
                 with launcher.scope("gather"):
-                    irradiance = _irradiance(launcher, device_scene, plan, world, hits, buffer, part, rays)
+                    irradiance = _irradiance(launcher, device_scene, plan, world, hits, buffer, part, rays, turns)
                     shade_indirect(
                         launcher,
                         part.points,
@@ -359,6 +363,7 @@ def _irradiance(
     buffer: GBuffer,
     part: _Part,
     rays: Any,
+    turns: Turns | None,
 ) -> tuple[Any, Any]:
     """Irradiance before and after at the part's points: sparse for what is seen, everywhere for what is hidden."""
     settings = plan.settings
@@ -367,11 +372,11 @@ def _irradiance(
         cone = _cone(plan, math.radians(settings.cones_aperture))
     shared = settings.seed, settings.cones_count, cone, part.with_before, hits, max(1, settings.antialias)
     aimed = 0.0 if part.with_before else settings.gather_aimed
-    real = Gatherer(scene, world, settings.gather_rays, *shared, aimed)
+    real = Gatherer(scene, world, settings.gather_rays, *shared, aimed, turns)
     if part.points is not buffer.points:
-        fewer = Gatherer(scene, world, max(1, settings.gather_rays // 4), *shared)
+        fewer = Gatherer(scene, world, max(1, settings.gather_rays // HIDDEN_FEWER), *shared, turns=turns)
         return gather_all(launcher, part.points, part.count, fewer)
-    synthetic = Gatherer(scene, world, settings.gather_object_rays, *shared)
+    synthetic = Gatherer(scene, world, settings.gather_object_rays, *shared, turns=turns)
     irradiance = launcher.empty(part.count, wp.vec3), launcher.empty(part.count, wp.vec3)
     how = {
         "radius": settings.gather_radius,
@@ -379,13 +384,14 @@ def _irradiance(
         "detail": settings.gather_detail,
     }
     change = 0.0 if part.with_before else settings.gather_change
-    gather_sparse(
-        launcher, buffer, Role.REAL, real, irradiance, stride=settings.gather_stride, change=change, kept=rays, **how
-    )
+    # Turns settle their rays by what is left of a time: the larger part can make up for more, so it comes last.
     if scene.synthetic is not None:
         gather_sparse(
             launcher, buffer, Role.SYNTHETIC, synthetic, irradiance, stride=settings.gather_object_stride, **how
         )
+    gather_sparse(
+        launcher, buffer, Role.REAL, real, irradiance, stride=settings.gather_stride, change=change, kept=rays, **how
+    )
     return irradiance
 
 

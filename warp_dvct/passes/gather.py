@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
@@ -19,6 +20,33 @@ from warp_dvct.scene import Material, Role, Scene
 PLANE_TOLERANCE = 0.5  # distance off the tangent plane, in gather strides, at which a gathered point counts 1/e
 FINEST = 2  # pixels to which details halve the stride
 SMOOTH_REACH = 0.25  # smoothing distance over the harmonic mean distance to the surfaces around
+# What is gathered, in this order: one point of each block of pixels, more at halved strides, points that no other tells
+# of; and the real surfaces behind objects, point by point.
+KINDS = ("blocks", "halved", "alone")
+REAL_PARTS = tuple(f"real {kind}" for kind in KINDS)
+OBJECT_PARTS = tuple(f"object {kind}" for kind in KINDS)
+HIDDEN = "hidden"
+GATHER_PARTS = (*OBJECT_PARTS, *REAL_PARTS, HIDDEN)
+HIDDEN_FEWER = 4  # times fewer rays of a hidden point
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A share of the points of a part, runs of neighbours that lie evenly over all of them: the ``number``-th of ``of``
+    such shares. ``rays``: Of a point."""
+
+    number: int
+    of: int
+    rays: int
+
+
+class Turns(Protocol):
+    """Says how many rays each turn gathers."""
+
+    def take(self, launcher: Launcher, part: str, count: int) -> Iterator[Turn]:
+        """The turns in which ``count`` points of one of ``GATHER_PARTS`` are gathered. Each is launched before the
+        next is asked for."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -27,7 +55,8 @@ class Gatherer:
 
     ``hits``: ``GlossyHits`` (:func:`glossy_hits`), for rays; None where surfaces met are taken as Lambertian.
     ``edge_samples``: Points of an edge pixel, which share its rays out. ``aimed``: Share of a point's rays that go
-    towards synthetic objects, where these take up little of its view; for points on real surfaces.
+    towards synthetic objects, where these take up little of its view; for points on real surfaces. ``turns``: Decide
+    on the rays instead of ``rays``, turn by turn; what was met is then not kept.
     """
 
     scene: DeviceScene
@@ -40,6 +69,7 @@ class Gatherer:
     hits: Any = None
     edge_samples: int = 1
     aimed: float = 0.0
+    turns: Turns | None = None
 
     def run(
         self,
@@ -51,6 +81,7 @@ class Gatherer:
         kept: Any = None,
         *,
         stride: int = 1,
+        part: str = HIDDEN,
     ) -> tuple[Any, Any]:
         """Irradiance [W m^-2] before and after at points ``index`` (-1 gives 0): two vec3 ``[count]``.
 
@@ -67,19 +98,24 @@ class Gatherer:
             how = [self.cones, self.cone, int(self.with_before), self.seed]
             launcher.launch(kernels._gather_cones, count, [*shared, *how], [before, after])
             return before, after
-        how = [
-            self.scene.targets,
-            self.rays,
-            self.aimed,
-            self.edge_samples,
-            stride,
-            self.seed,
-            kept or keep_rays(launcher, 0, 0),
-        ]
-        if self.hits is None:
-            launcher.launch(kernels._gather_rays, count, [*shared, *how], [before, after, nearness])
-        else:
-            launcher.launch(kernels._gather_rays_glossy, count, [*shared, self.hits, *how], [before, after, nearness])
+        kernel = kernels._gather_rays if self.hits is None else kernels._gather_rays_glossy
+        if self.hits is not None:
+            shared.append(self.hits)
+        turns = [Turn(0, 1, self.rays)] if self.turns is None else self.turns.take(launcher, part, count)
+        for turn in turns:
+            how = [
+                self.scene.targets,
+                wp.vec3i(turn.number, turn.of, count),
+                turn.rays,
+                self.aimed,
+                self.edge_samples,
+                stride,
+                self.seed,
+                keep_rays(launcher, 0, 0) if kept is None or self.turns is not None else kept,
+            ]
+            runs = -(-count // kernels.RUN)
+            elements = -(-runs // turn.of) * kernels.RUN
+            launcher.launch(kernel, elements, [*shared, *how], [before, after, nearness])
         return before, after
 
 
@@ -178,10 +214,11 @@ def gather_sparse(
         kept: ``KeptRays`` with a slot per block, for the role REAL.
     """
     columns, rows = -(-buffer.width // stride), -(-buffer.height // stride)
+    parts = REAL_PARTS if role == Role.REAL else OBJECT_PARTS
     gathered = _choose(launcher, buffer, stride, columns, rows, role, gatherer.seed)
     nearness = launcher.zeros(columns * rows, wp.float32)
     before, after = gatherer.run(
-        launcher, buffer.points, gathered.choice, columns * rows, nearness, kept, stride=stride
+        launcher, buffer.points, gathered.choice, columns * rows, nearness, kept, stride=stride, part=parts[0]
     )
     grid = _Grid(stride, columns, rows, gathered, nearness, before, after)
     steps = smoothing if gatherer.cone is None else 0
@@ -197,7 +234,7 @@ def gather_sparse(
         [*irradiance, missing],
     )
     _, index, left = compact(launcher, missing)
-    found = gatherer.run(launcher, buffer.points, index, left)
+    found = gatherer.run(launcher, buffer.points, index, left, part=parts[2])
     launcher.launch(reconstruction._scatter_missing, left, [index, *found], [*irradiance])
 
 
@@ -262,7 +299,8 @@ def _refine(
     index = launcher.empty(max(1, found), wp.int32)
     launcher.launch(reconstruction._pick, found, [listed, gathered.choice], [index])
     near = launcher.empty(max(1, found), wp.float32)
-    fresh = gatherer.run(launcher, points, index, found, near, stride=stride)
+    part = (REAL_PARTS if role == Role.REAL else OBJECT_PARTS)[1]
+    fresh = gatherer.run(launcher, points, index, found, near, stride=stride, part=part)
     launcher.launch(reconstruction._put_detail, found, [listed, *fresh, near], [before, after, nearness])
     return _smooth(launcher, buffer, _Grid(stride, columns, rows, gathered, nearness, before, after), mark, smoothing)
 
