@@ -142,6 +142,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "bounces": 4,
         "volume.resolution": 32,
+        "volume.coarse": 32,
         "rsm.texels": 240,
         "antialias": 2,
         "shadows.samples": 4,
@@ -158,7 +159,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     "balanced": {},
     "high": {
         "bounces": 12,
-        "volume.resolution": 96,
+        "volume.resolution": 64,
+        "volume.coarse": 48,
         "rsm.density": 3,
         "shadows.samples": 32,
         "shadows.probes": 16,
