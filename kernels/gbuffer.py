@@ -204,14 +204,21 @@ def _see_synthetic(
     mats: Materials,
     cam: CameraFrame,
     reach_in: wp.array(dtype=wp.float32),
+    window: wp.vec4i,
     width: int,
     height: int,
     points_out: Points,
 ):
     """Put synthetic surfaces in front of what ``points_out`` holds of the real scene, once those of the frame before
-    are taken out."""
+    are taken out. None is seen outside of ``window``: its first and last column, first and last row."""
     i = first + wp.tid()
-    ray = camera_ray(cam, float(i % width) + 0.5, float(i / width) + 0.5, width, height)
+    points_out.slot[i] = WHOLE
+    x = i % width
+    y = i / width
+    if x < window[0] or x > window[1] or y < window[2] or y > window[3]:
+        if points_out.role[i] != SYNTHETIC:
+            return
+    ray = camera_ray(cam, float(x) + 0.5, float(y) + 0.5, width, height)
     spread = (cam.tan_right - cam.tan_left) / float(width)
     hit = trace_synthetic(geo, ray.origin, ray.direction, reach_in[i])
     if hit.found == 0 and points_out.role[i] == SYNTHETIC:
@@ -219,7 +226,6 @@ def _see_synthetic(
         store_hit(geo, mats, hit, ray.origin, ray.direction, spread, i, points_out)
     elif hit.found != 0:
         store_hit(geo, mats, hit, ray.origin, ray.direction, spread, i, points_out)
-    points_out.slot[i] = WHOLE
 
 
 @wp.func

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
@@ -14,6 +15,7 @@ from warp_dvct.launch import Launcher
 from warp_dvct.passes.sorting import scan
 
 EDGE_SHARE = 8  # room for one edge point in so many pixels is there from the start, and saves most pictures a copy
+WINDOW_MARGIN = 1e-6  # of the farthest corner of a box: depths below are not told from 0
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,25 @@ def see_real(launcher: Launcher, scene: DeviceScene, width: int, height: int, *,
     return view
 
 
+def objects_window(scene: DeviceScene, width: int, height: int) -> tuple[int, int, int, int]:
+    """First and last column, first and last row of a picture that the box around the synthetic objects may reach; all
+    of them where the box is not wholly in front of the camera."""
+    geometry, cam = scene.geometry, scene.camera
+    if not geometry.has_synthetic:
+        return 0, -1, 0, -1
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
+    corners = np.array(geometry.center) + signs * np.array(geometry.extent) - np.array(cam.origin)
+    depth = corners @ np.array(cam.forward)
+    if depth.min() <= WINDOW_MARGIN * np.abs(corners).max():
+        return 0, width - 1, 0, height - 1
+    x = (corners @ np.array(cam.right) / depth - cam.tan_left) / (cam.tan_right - cam.tan_left) * width
+    y = (corners @ np.array(cam.up) / depth - cam.tan_top) / (cam.tan_bottom - cam.tan_top) * height
+    # A pixel more on each side than the box meets: rounding moves no ray that far.
+    columns = np.clip([x.min() - 2.0, x.max() + 1.0], -1, width)
+    rows = np.clip([y.min() - 2.0, y.max() + 1.0], -1, height)
+    return int(columns[0]), int(columns[1]), int(rows[0]), int(rows[1])
+
+
 def new_view(launcher: Launcher, scene: DeviceScene, width: int, height: int) -> View:
     """The real scene alone, with room for the edges of most pictures."""
     return see_real(launcher, scene, width, height, edge_room=width * height // EDGE_SHARE)
@@ -100,7 +121,8 @@ def render_gbuffer(
     pixels = width * height
     shared = [scene.geometry, scene.materials, scene.camera]
     view = view or new_view(launcher, scene, width, height)
-    launcher.launch(kernels._see_synthetic, pixels, [*shared, view.reach, width, height], [view.points])
+    window = wp.vec4i(*objects_window(scene, width, height))
+    launcher.launch(kernels._see_synthetic, pixels, [*shared, view.reach, window, width, height], [view.points])
     mark = launcher.zeros(pixels, wp.int32)
     if edge_samples > 0:
         launcher.launch(kernels._mark_edges, pixels, [view.points, width, height, int(paint)], [mark])
