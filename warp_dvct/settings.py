@@ -159,8 +159,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "balanced": {},
     "high": {
         "bounces": 12,
-        "volume.resolution": 64,
-        "volume.coarse": 48,
         "rsm.density": 3,
         "shadows.samples": 32,
         "shadows.probes": 16,
