@@ -154,14 +154,15 @@ def _keep(scene: Any, budget: float, plate: np.ndarray, options: BudgetOptions, 
 
 
 HEAD = (
-    f"{'':17}{'budget':>8}{'predicted':>11}{'actual':>8}{'ratio':>7}{'CPU s':>8}{'rays planned':>14}{'settled':>9}"
+    f"{'':17}{'budget':>8}{'predicted':>11}{'actual':>8}{'ratio':>7}{'CPU s':>8}{'planned':>14}{'settled':>9}"
     f"{'slowness':>10}{'FLIP pred.':>12}{'actual':>8}{'ratio':>7}"
 )
 
 
 def format_row(row: dict[str, Any]) -> str:
-    """A line under :data:`HEAD`; ratios are actual time over budget and actual over predicted error, ``slowness`` is
-    what the frame had taken over its prediction when the rays were settled."""
+    """A line under :data:`HEAD`; ratios are actual time over budget and actual over predicted error, ``planned`` and
+    ``settled`` are rays a point or samples a pixel, ``slowness`` is what the frame had taken over its prediction when
+    the rays were settled, or what all samples took over theirs."""
     if "refused" in row:
         return f"{row['stage']:17}{row['budget']:8.2f}  {row['refused']}"
     predicted, flip, settled = row["predicted"], row["flip"], row["predicted"].get("settled")
@@ -170,7 +171,7 @@ def format_row(row: dict[str, Any]) -> str:
         f"{row['seconds'] / row['budget']:7.2f}{row['cpu_seconds']:8.2f}"
     )
     if settled is not None:
-        line += f"{settled['planned']:14}{settled['rays']:9}{settled['slowness']:10.2f}"
+        line += f"{settled['planned']:14}{settled.get('rays', settled.get('samples')):9}{settled['slowness']:10.2f}"
     else:
         line += f"{'-':>14}{'-':>9}{'-':>10}"
     if flip is not None and predicted["error"] is not None:
@@ -201,8 +202,8 @@ def summarise(rows: Sequence[dict[str, Any]]) -> str:
     slowness = [r["predicted"]["settled"]["slowness"] for r in kept if r["predicted"].get("settled")]
     if slowness:
         lines.append(
-            f"the frames' first passes took from {min(slowness):.2f} to {max(slowness):.2f} of their prediction, by"
-            " which rays were settled"
+            f"the frames' {'samples' if kept[0].get('method') == 'path-trace' else 'first passes'} took from"
+            f" {min(slowness):.2f} to {max(slowness):.2f} of their prediction"
         )
     errors = [r["flip"] / r["predicted"]["error"] for r in kept if r["flip"] and r["predicted"]["error"]]
     if errors:

@@ -224,9 +224,8 @@ def test_later_frames_keep_the_mean_rays(monkeypatch, tmp_path):
     alone = Relighter(path("colour_bleeding"), width=48, settings=choice.to_dict()["chosen"]).render()
     np.testing.assert_array_equal(second.comp, alone.comp)
     np.testing.assert_array_equal(second.delta, alone.delta)
-    # The first has other noise alone.
-    noise = np.abs(first.comp - alone.comp).mean() / alone.comp.mean()
-    assert noise < 0.03, noise
+    # The first has other noise alone; how much goes by the clock, at most that of eight rays a point.
+    assert np.abs(first.comp - alone.comp).mean() < 0.5 * alone.comp.mean()
 
 
 @pytest.mark.parametrize("with_before", [False, True])

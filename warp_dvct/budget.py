@@ -34,6 +34,7 @@ from warp_dvct.cost_vpls import count_vpl_work
 from warp_dvct.errors import OptionError
 from warp_dvct.pace import Pace
 from warp_dvct.passes.gather import FINEST
+from warp_dvct.sample_pace import SamplePace, SettledSamples
 from warp_dvct.settings import NAMES, QUALITIES, Settings, make_settings
 from warp_dvct.survey import Survey
 from warp_dvct.turns import RAYS_SET
@@ -62,7 +63,8 @@ class Choice:
         floor: Seconds of the cheapest choice. fixed: Settings that the user gave.
         reasons: Lines for people: what was chosen, what was left out and why.
         enough: Whether more time would buy nothing that shows, so that some of the budget is left.
-        pace: Settles the rays of the first frame by the time that is left then; None where they are not for it to say.
+        pace: Settles the rays or samples of the first frame by the time that is left; None where they are not for it to
+            say.
     """
 
     method: str
@@ -74,7 +76,7 @@ class Choice:
     fixed: tuple[str, ...]
     reasons: tuple[str, ...]
     enough: bool = False
-    pace: Pace | None = field(default=None, compare=False)
+    pace: Pace | SamplePace | None = field(default=None, compare=False)
 
     def describe(self) -> str:
         """Some lines for a terminal."""
@@ -94,7 +96,9 @@ class Choice:
         if self.method == "path-trace":
             chosen = {"samples": self.settings.samples}
         settled = self.pace.settled if self.pace is not None else None
-        if settled is not None:
+        if isinstance(settled, SettledSamples):
+            chosen["samples"] = settled.samples
+        elif settled is not None:
             chosen |= {name: settled.rays for name in RAYS_SET}
         return {
             "seconds": self.seconds,

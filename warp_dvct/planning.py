@@ -22,6 +22,7 @@ from warp_dvct.methods.path_tracing import PathTracer
 from warp_dvct.metrics import to_display
 from warp_dvct.pace import SLOWNESS, try_machine
 from warp_dvct.plan import make_plan
+from warp_dvct.sample_pace import SamplePace
 from warp_dvct.scene import Scene
 from warp_dvct.settings import Settings, make_settings
 from warp_dvct.survey import survey
@@ -33,6 +34,7 @@ PILOT_SAMPLES = 4
 FLIP_OF_NOISE = 2.35
 FALLS = (0.1, 0.5)  # with the root of the samples, unless bright paths are so rare that they are mostly missed
 MOST_SAMPLES = 2**20
+MOST_FASTER = 4  # times the planned samples, on a machine that turns out to be faster
 
 
 def choose_settings(
@@ -142,6 +144,10 @@ def _path_trace(
             else f"--budget {budget:g} s is more than {MOST_SAMPLES} samples a pixel take"
         )
     chosen = make_settings("balanced", {**fixed, "samples": samples})
+    pace = None
+    if budget is not None and "samples" not in fixed:
+        most = min(MOST_FASTER * samples, MOST_SAMPLES)
+        pace = SamplePace(budget, each, samples, most, paths.spent)
     return Choice(
         "path-trace",
         chosen,
@@ -155,6 +161,7 @@ def _path_trace(
             f"noise falls with samples to the power of {paths.falls:.2f}, from FLIP"
             f" {paths.error(PILOT_SAMPLES):.3f} at {PILOT_SAMPLES}",
         ),
+        pace=pace,
     )
 
 

@@ -21,6 +21,7 @@ from warp_dvct.passes.composite import composite
 from warp_dvct.passes.difference import tonemap_difference
 from warp_dvct.passes.lens import LensView
 from warp_dvct.plan import Plan, make_plan
+from warp_dvct.sample_pace import SamplePace
 from warp_dvct.scene import Notice, Role, Scene
 from warp_dvct.scene_check import check_scene
 from warp_dvct.settings import make_settings
@@ -99,7 +100,7 @@ class Relighter:
         self._uploaded: tuple[str, DeviceScene, Lit | None] | None = None
         self._kept = Kept()
         self._had_plate = False
-        self._pace: Pace | None = None
+        self._pace: Pace | SamplePace | None = None
         self._method_notices: tuple[Notice, ...] = ()
         self.stats: dict[str, Any] = {}
         self.load_seconds = 0.0
@@ -146,8 +147,8 @@ class Relighter:
     ) -> Choice:
         """Choose the settings for a time, or for an error, from now on; those given by name stay as they are.
 
-        Under a time the next frame settles how many rays are gathered, by the time that is left then; later frames
-        keep the mean number of its points.
+        Under a time the next frame settles how many rays are gathered, or paths traced, by the time that is left then;
+        later frames keep the number, of rays the mean of its points.
 
         Args:
             seconds: For one frame from scratch on this machine, without loading and compiling.
@@ -297,7 +298,7 @@ class Relighter:
             delta_cone_tracing.LightField,
             lambda uploaded: delta_cone_tracing.light_volumes(launcher, scene, uploaded, plan, self._kept),
         )
-        turns, pace = None, self._pace
+        turns, pace = None, None if isinstance(self._pace, SamplePace) else self._pace
         if pace is not None:
             with launcher.scope("settle"):
                 turns = pace.settle(launcher, scene, device_scene, light_field, self.settings)
@@ -326,19 +327,22 @@ class Relighter:
         return tonemap_difference(launcher, radiance, plate) if plate is not None and tonemapped else radiance
 
     def _path_trace(self, report: Progress) -> Radiance:
-        device_scene = self._device_scene()
+        shared = self._launcher, self._device_scene(), self._drawn, self.plan.width, self.plan.height
+        how = {"bounces": self.settings.bounces, "seed": self.settings.seed}
+
+        def progress(done: int, total: int) -> None:
+            report("path trace", 0.95 * done / total)
+
         with self._launcher.scope("path trace"):
-            radiance = path_tracing.path_trace(
-                self._launcher,
-                device_scene,
-                self._drawn,
-                self.plan.width,
-                self.plan.height,
-                samples=self.settings.samples,
-                bounces=self.settings.bounces,
-                seed=self.settings.seed,
-                progress=lambda done, total: report("path trace", 0.95 * done / total),
-            )
+            if isinstance(self._pace, SamplePace):
+                tracer = path_tracing.PathTracer(*shared, **how)
+                samples = self._pace.trace(self._launcher, tracer, progress)
+                radiance = tracer.resolve()
+                self._pace, self.settings = None, replace(self.settings, samples=samples)
+                self._plan(has_plate=self._had_plate)
+            else:
+                samples = self.settings.samples
+                radiance = path_tracing.path_trace(*shared, samples=samples, **how, progress=progress)
         return self._through_lens(radiance)
 
 

@@ -51,6 +51,10 @@ def test_a_line_says_what_was_planned_and_settled():
     unsettled = row(2.2)
     unsettled["predicted"] |= {"settled": None, "enough": True}
     assert module.format_row(unsettled).endswith("more would not show")
+    traced = row(2.2) | {"method": "path-trace"}
+    traced["predicted"] |= {"settled": {"samples": 12, "planned": 10, "slowness": 0.8}}
+    assert module.format_row(traced).split()[6:9] == ["10", "12", "0.80"]
+    assert "the frames' samples took from 0.80" in module.summarise([traced])
     assert "floor" in module.format_row({"stage": "s", "budget": 1.0, "refused": "below the floor"})
 
 
