@@ -152,7 +152,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "gather.object_rays": 16,
         "glossy.rays": 2,
         "glossy.smoothing": 0.5,
-        "patches.count": 512,
+        "patches.count": 2048,
         "patches.rays": 32,
         "samples": 16,
     },
