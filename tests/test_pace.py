@@ -211,7 +211,8 @@ def test_later_frames_keep_the_mean_rays(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     relighter = Relighter(path("colour_bleeding"), width=48)
     choice = relighter.keep_budget(1.0)
-    first, settled = relighter.render(), choice.pace.settled
+    relighter.render()
+    settled = choice.pace.settled
     assert relighter.settings == with_rays(choice.settings, settled.rays) == relighter.plan.settings
     assert settled.planned == choice.settings.gather_rays
     assert min(settled.turns) <= settled.rays <= max(settled.turns)
@@ -224,8 +225,33 @@ def test_later_frames_keep_the_mean_rays(monkeypatch, tmp_path):
     alone = Relighter(path("colour_bleeding"), width=48, settings=choice.to_dict()["chosen"]).render()
     np.testing.assert_array_equal(second.comp, alone.comp)
     np.testing.assert_array_equal(second.delta, alone.delta)
-    # The first has other noise alone; how much goes by the clock, at most that of eight rays a point.
-    assert np.abs(first.comp - alone.comp).mean() < 0.5 * alone.comp.mean()
+
+
+def test_the_clock_decides_on_nothing_but_each_turn_s_rays(monkeypatch, tmp_path):
+    """The first frame again with the rays that the clock gave each turn is the same bit for bit."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    monkeypatch.setattr("warp_dvct.planning._slowness", lambda *args: 1.0)
+    calls: list[list[Turn]] = []
+    take = GatherTurns.take
+
+    def record(self, launcher, part, count):
+        calls.append([])
+        for turn in take(self, launcher, part, count):
+            calls[-1].append(turn)
+            yield turn
+
+    def repeat(self, launcher, part, count):
+        yield from calls.pop(0)
+
+    frames = []
+    for instead in (record, repeat):
+        monkeypatch.setattr(GatherTurns, "take", instead)
+        relighter = Relighter(path("colour_bleeding"), width=48)
+        relighter.keep_budget(1.0)
+        frames.append(relighter.render())
+    assert not calls
+    for layer in ("comp", "delta", "rgba"):
+        np.testing.assert_array_equal(*(getattr(frame, layer) for frame in frames))
 
 
 @pytest.mark.parametrize("with_before", [False, True])

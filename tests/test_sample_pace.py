@@ -74,6 +74,7 @@ def test_a_settled_picture_is_that_of_its_samples():
     """The first frame settles the samples; it, and the next, equal a new frame of as many bit for bit."""
     relighter = Relighter(path("colour_bleeding"), method="path-trace", width=32)
     choice = relighter.keep_budget(0.5)
+    assert "samples is settled while the frame is traced" in choice.describe()
     first, settled = relighter.render(), choice.pace.settled
     assert choice.to_dict()["chosen"]["samples"] == settled.samples == relighter.settings.samples
     assert choice.to_dict()["settled"]["planned"] == choice.settings.samples

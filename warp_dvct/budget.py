@@ -84,9 +84,8 @@ class Choice:
         head = f"predicted: {self.seconds:.2f} s ({self.cpu_seconds:.2f} s of processor time), {error}"
         lines = [head, *(f"  {line}" for line in self.reasons)]
         if self.pace is not None:
-            lines.append(
-                "  gather.rays is settled while the frame is gathered, again and again, by the time that is left"
-            )
+            what, how = ("samples", "traced") if self.method == "path-trace" else ("gather.rays", "gathered")
+            lines.append(f"  {what} is settled while the frame is {how}, again and again, by the time that is left")
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:

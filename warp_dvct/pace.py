@@ -80,9 +80,8 @@ class Pace:
 
     Attributes:
         width, height: Of the picture.
-        aim: Seconds that the planning and the frame are to take together: all of the budget, for rays on trial take 1.1
-            times as long as the gather's (mean of five stages at two budgets; 0.9 to 1.4), whose points' neighbours
-            have brought the scene into the caches.
+        aim: Seconds that the planning and the frame are to take together: all of the budget, as the gather's turns
+            follow the clock.
         units: Seconds of the clock by pass and unit, see ``CostModel.clock_units``. cpu_units: Of the processor.
         count: From settings to counts by pass of a frame.
         least, most: Rays of a point.

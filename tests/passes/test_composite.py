@@ -98,6 +98,21 @@ def test_comp_is_the_recombination_of_the_stored_layers(launcher):
         np.testing.assert_array_equal(half(values), values, err_msg=name)
 
 
+def test_layers_are_rounded_to_the_nearest_half(launcher):
+    """Ties to even, bit for bit as NumPy rounds: halves, the middles between them, what lies just beside these, and
+    numbers of every size, those below the smallest half and both zeros included."""
+    halves = np.arange(65536, dtype=np.uint16).view(np.float16).astype(np.float32)
+    halves = np.sort(halves[np.isfinite(halves)])
+    middles = 0.5 * (halves[1:] + halves[:-1])
+    beside = [np.nextafter(middles, np.float32(s) * np.inf) for s in (-1, 1)]
+    sizes = np.random.default_rng(3).standard_normal(30_000) * np.logspace(-12, 4, 30_000)
+    values = np.concatenate([halves, middles, *beside, sizes, [0.0, -0.0]]).astype(np.float32)
+    values = np.resize(values, (-(-len(values) // 3), 3))
+    nothing = np.zeros_like(values)
+    layers = run(launcher, None, nothing, np.zeros((len(values), 4)), values[None])
+    np.testing.assert_array_equal(bits(layers.plate[0]), bits(values))
+
+
 def test_every_half_plate_comes_back_bit_for_bit(launcher):
     values = np.arange(65536, dtype=np.uint16).view(np.float16)
     values = values[np.isfinite(values)].astype(np.float32)
