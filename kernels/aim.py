@@ -10,7 +10,7 @@ import warp as wp
 from warp_dvct.kernels.materials import Surface
 from warp_dvct.kernels.sampling import PI, tangent_of
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 WIDEST = wp.constant(0.5)  # share of the disk from which on aiming says no more than the cosine does
 ROUND = wp.constant(3.0)  # radians of azimuth from which on objects are taken to be all around

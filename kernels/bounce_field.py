@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_dvct.kernels.volume import Volume, between_voxels, corner_step, corner_weight, face_of, find_record
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 NEAREST_SHARE = wp.constant(1.0e-4)  # weight of a patch at the far corner: it speaks where no other does
 HIDDEN_SHARE = wp.constant(1.0e-4)  # of the weight of a patch beyond a wall, likewise

@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_dvct.kernels.volume import Volume, between_voxels, corner_step, corner_weight, face_of, find_record
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 OPAQUE = wp.constant(0.999)  # a march ends when this share of the cone is covered in both solutions
 

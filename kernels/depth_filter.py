@@ -7,7 +7,7 @@ infinitely far away and never a surface at the origin. Camera axes are OpenCV's,
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 SOURCE_TILE = wp.constant(8)  # quads an edge of the blocks whose boxes are tested
 TARGET_TILE = wp.constant(16)  # pixels an edge of what one thread draws

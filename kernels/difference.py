@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_dvct.kernels.tonemap import encode_srgb, fade_highlights
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func

@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_dvct.kernels.depth_filter import Lens, Limits, same_surface
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 TILE = wp.constant(8)  # pixels an edge of the blocks that are left out where no jump is near
 REACH = wp.constant(3)  # pixels to each side that tell both surfaces' colours

@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_dvct.kernels.sampling import PI, TWO_PI
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.struct

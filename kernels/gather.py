@@ -36,7 +36,7 @@ from warp_dvct.kernels.materials import (
 from warp_dvct.kernels.radiosity import Incident, World, radiosity_at
 from warp_dvct.kernels.sampling import INV_PI, PI, concentric_disk, from_frame, sobol2, uniform1
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 RUN = 32  # points
 

@@ -15,7 +15,7 @@ from warp_dvct.kernels.geometry import (
 from warp_dvct.kernels.materials import Materials, Surface, surface_at
 from warp_dvct.kernels.sampling import sobol2
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 BACKGROUND = wp.constant(-1)
 REAL = wp.constant(0)

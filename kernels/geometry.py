@@ -2,7 +2,7 @@
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Stands for infinity as a ray length: squares of it still fit into a float32.
 FAR = wp.constant(1.0e18)

@@ -23,7 +23,7 @@ from warp_dvct.kernels.materials import (
 from warp_dvct.kernels.sampling import PI, sobol2
 from warp_dvct.kernels.shading import SHADOW_END, look, power_share, reflect_visible, vndf_pdf
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 FOCUSING = wp.constant(0.2)  # a GGX alpha up to which a lobe sends light to places rather than all around
 NEGLIGIBLE = wp.constant(0.01)  # share of the diffuse light below which a lobe's light is not worth a shadow ray

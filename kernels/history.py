@@ -9,7 +9,7 @@ import warp as wp
 from warp_dvct.kernels.gbuffer import BACKGROUND, Points
 from warp_dvct.kernels.geometry import CameraFrame
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 PLANE_GAP = wp.constant(2.0)  # footprints by which the found place may lie off the point's tangent plane
 REACH = wp.constant(4.0)  # footprints up to which a found place is a neighbour at all

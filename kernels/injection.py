@@ -5,7 +5,7 @@ import warp as wp
 from warp_dvct.kernels.sorting import EMPTY_KEY
 from warp_dvct.kernels.volume import Volume, face_weight, find_record
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 NUDGE = wp.constant(0.3)  # voxels; a point on the wall between two voxels may round into the empty one
 

@@ -28,7 +28,7 @@ from warp_dvct.kernels.materials import (
 from warp_dvct.kernels.sampling import sobol2, tangent_of
 from warp_dvct.kernels.vpls import Vpls
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 RAY_END = wp.constant(0.9999)  # of the way to a VPL, whose own surface is not in its way
 STEEPEST = wp.constant(1.0e-3)  # cosine at which a splat is seen edge-on and left out

@@ -9,7 +9,7 @@ from warp_dvct.kernels.geometry import FAR, Geometry, occluded_by_real
 from warp_dvct.kernels.lights import Lights, sample_light
 from warp_dvct.kernels.sampling import PI, cosine_hemisphere, from_frame, sobol2
 
-wp.set_module_options({"enable_backward": True})
+wp.set_module_options({"enable_backward": True, "fuse_fp": False})
 
 HARMONICS = wp.constant(9)  # real spherical harmonics of degree 0 to 2
 DOME_DIMENSION = wp.constant(0)

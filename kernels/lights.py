@@ -10,7 +10,7 @@ import warp as wp
 from warp_dvct.kernels.geometry import FAR
 from warp_dvct.kernels.sampling import PI, TWO_PI, concentric_disk, from_frame, uniform_cone
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 POINT = wp.constant(0)
 SPHERE = wp.constant(1)

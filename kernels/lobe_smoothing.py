@@ -5,7 +5,7 @@ import warp as wp
 from warp_dvct.kernels.gbuffer import SYNTHETIC, Points
 from warp_dvct.kernels.reconstruction import falloff
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 TAPS = wp.constant(2)  # to each side
 WIDEST = wp.constant(4)  # pixels between taps at most

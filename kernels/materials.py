@@ -10,7 +10,7 @@ import warp as wp
 from warp_dvct.kernels.geometry import OFFSET_RELATIVE, Geometry, Hit, corner_position, largest_coordinate
 from warp_dvct.kernels.sampling import INV_PI, TWO_PI, cosine_hemisphere, from_frame, luminance, tangent_of
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # The smoothest surface: below it the lobe is narrower than float32 half vectors resolve.
 ALPHA_FLOOR = wp.constant(1.0e-3)

@@ -17,7 +17,7 @@ from warp_dvct.kernels.geometry import (
 from warp_dvct.kernels.materials import Materials, Surface, hemispherical_albedo, surface_at
 from warp_dvct.kernels.volume import Volume, brick_extent, face_weight, find_record, key_cell
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 MOST_SHEETS = wp.constant(4)  # patches behind one face
 LIFT = wp.constant(0.25)  # voxels of the patches' level that a patch looks around from above its surface

@@ -38,7 +38,7 @@ from warp_dvct.kernels.materials import (
 )
 from warp_dvct.kernels.sampling import PI, cosine_hemisphere, from_frame, sobol2
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Which of the two pictures a path contributes to.
 BEFORE = wp.constant(1)

@@ -9,7 +9,7 @@ from warp_dvct.kernels.volume import (
     key_cell,
 )
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 DIRECTIONAL = wp.constant(0)
 ISOTROPIC = wp.constant(1)

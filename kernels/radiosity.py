@@ -5,7 +5,7 @@ import warp as wp
 from warp_dvct.kernels.environment import Environment
 from warp_dvct.kernels.volume import Volume, between_voxels, corner_step, corner_weight, face_of, find_record
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 FAINT = wp.constant(1.0e-6)  # coverage below which a voxel says nothing of a surface
 # Share of a face that a voxel must hold to stand alone: whole texels of a map land in slivers or miss them, so that a

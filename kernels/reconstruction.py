@@ -5,7 +5,7 @@ import warp as wp
 from warp_dvct.kernels.gbuffer import BACKGROUND, Points
 from warp_dvct.kernels.sampling import uniform1
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.struct

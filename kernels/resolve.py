@@ -6,7 +6,7 @@ from warp_dvct.kernels.environment import Environment, environment_radiance
 from warp_dvct.kernels.gbuffer import BACKGROUND, REAL, SYNTHETIC, Points
 from warp_dvct.kernels.geometry import CameraFrame
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.kernel

@@ -22,7 +22,7 @@ from warp_dvct.kernels.sampling import (
     uniform_cone,
 )
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.struct

@@ -8,7 +8,7 @@ from warp_dvct.kernels.materials import Materials, spawn_point, surface_at
 from warp_dvct.kernels.rsm import Target, emit_beam
 from warp_dvct.kernels.sampling import cosine_hemisphere, from_frame, sobol2
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.kernel

@@ -30,7 +30,7 @@ from warp_dvct.kernels.radiosity import Incident, World
 from warp_dvct.kernels.sampling import INV_PI, sobol2
 from warp_dvct.kernels.shading import SHADOW_END, power_share, reflect_visible, vndf_pdf
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 # A GGX alpha from which on a lobe blurs what it shows by more than the voxels do: its rays read their radiosity, but

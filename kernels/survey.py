@@ -8,7 +8,7 @@ from warp_dvct.kernels.geometry import FAR, Geometry, trace_real, trace_syntheti
 from warp_dvct.kernels.materials import spawn_point
 from warp_dvct.kernels.sampling import cosine_hemisphere, from_frame, sobol2
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func

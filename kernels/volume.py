@@ -8,7 +8,7 @@ front-facing area projected onto the face over the face's area, clamped to 1.
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 BRICK = wp.constant(8)
 BRICK_CELLS = wp.constant(512)

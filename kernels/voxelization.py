@@ -9,7 +9,7 @@ import warp as wp
 from warp_dvct.kernels.sorting import EMPTY_KEY
 from warp_dvct.kernels.volume import BRICK, brick_extent, cell_key, face_weight, key_cell
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 SLIVER = wp.constant(1.0e-7)  # voxel faces; smaller cuts are rounding where a triangle only touches a voxel,
 SLIVER_SHARE = wp.constant(1.0e-3)  # unless they are more than this share of a triangle that is itself so small

@@ -7,7 +7,7 @@ from warp_dvct.kernels.ism import ALL, RAY_END, Cloud, Sight, map_sight, ray_sig
 from warp_dvct.kernels.sampling import INV_PI, luminance, sobol1, uniform1
 from warp_dvct.kernels.vpls import SURFACE, Vpls
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 NEAREST = wp.constant(1.0e-12)
 ONE_PLANE = wp.constant(0.1)  # of the offset of rays: what a distance within it may be by rounding

@@ -30,7 +30,7 @@ from warp_dvct.kernels.shading import SHADOW_END, Direct, look, reflect_visible,
 from warp_dvct.kernels.specular import Glossy, lights_along
 from warp_dvct.kernels.vpls import SKY, Vpls
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 NEAREST = wp.constant(1.0e-12)  # squared distance below which a VPL and a point are one
 TOO_FEW = wp.constant(0.7)  # share of the interleaved sets that a point needs from its neighbours

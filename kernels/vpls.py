@@ -11,7 +11,7 @@ from warp_dvct.kernels.geometry import OFFSET_RELATIVE
 from warp_dvct.kernels.sampling import PI, TWO_PI, luminance, sobol2, uniform1
 from warp_dvct.kernels.warping import Chain, warp_point
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 SURFACE = wp.constant(0)
 SKY = wp.constant(1)

@@ -5,7 +5,7 @@ import warp as wp
 from warp_dvct.kernels.bounce_field import BounceField, Patch, off_surface, wall_beside
 from warp_dvct.kernels.volume import Volume, brick_extent, find_record, key_cell
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 WALL_AREA = wp.constant(0.25)  # share of its voxel's face that a side of a thin wall covers
 CLEARLY = wp.constant(1.05)  # how much larger a wall has to be than another of the same voxel: equal ones stay in order

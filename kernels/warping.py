@@ -8,7 +8,7 @@ each split add up to one whatever the parents were rounded to.
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 BELOW_ONE = wp.constant(wp.float64(0.9999999999999999))
 

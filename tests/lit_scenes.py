@@ -130,7 +130,7 @@ def areas(voxels: Voxels) -> np.ndarray:
     return voxels.area.numpy()[: voxels.level_records[0] * 6].reshape(-1, 6, 2).astype(float)
 
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.kernel

@@ -348,6 +348,7 @@ def test_calibrating_measures_every_pass(monkeypatch):
         calibrate(frames=3)
 
 
+@pytest.mark.cpu
 def test_a_relighter_keeps_a_budget(monkeypatch, tmp_path):
     """The chosen settings are those of the next frame."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
@@ -436,6 +437,7 @@ def test_a_budget_that_buys_nothing_more_is_said(surveys):
     assert not chosen(surveys, seconds=1.0).enough
 
 
+@pytest.mark.cpu
 def test_a_scan_s_points_are_part_of_what_is_surveyed(monkeypatch, tmp_path):
     """Point clouds are drawn as surfels; a budget that did not see them would find less of the scene."""
     from warp_dvct import planning

@@ -205,6 +205,7 @@ def test_the_machine_s_trial_is_work_of_a_known_amount(launcher, monkeypatch):
     assert 0.0 < usual < try_machine(launcher)
 
 
+@pytest.mark.cpu
 def test_later_frames_keep_the_mean_rays(monkeypatch, tmp_path):
     """The first frame settles the rays while it gathers; the next equals a new frame of the settings that the
     statistics name bit for bit, and is not voxelised again."""
@@ -227,6 +228,7 @@ def test_later_frames_keep_the_mean_rays(monkeypatch, tmp_path):
     np.testing.assert_array_equal(second.delta, alone.delta)
 
 
+@pytest.mark.cpu
 def test_the_clock_decides_on_nothing_but_each_turn_s_rays(monkeypatch, tmp_path):
     """The first frame again with the rays that the clock gave each turn is the same bit for bit."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))

@@ -24,6 +24,7 @@ from warp_dvct.targets import targets_of
 
 # A closed mesh may be met from behind by the odd ray that slips through an edge; this many are no accident.
 BACKS_MET = 4
+LEAST_SIDE = 1e-6  # sine of the angle between a flat light's plane and its direction, below which it has no side
 BOX_MARGIN = 1e-3  # of the largest edge of the box around the objects: keeps rounding from culling a ray at its border
 
 
@@ -311,7 +312,13 @@ def _emission_axis(light: Light) -> np.ndarray:
         normal = np.cross(light.axis_x, light.axis_y)
         if np.linalg.norm(normal) == 0.0:
             raise StageError(f"{light.path}: the light has no area; give it a positive size")
-        direction = normal if np.dot(normal, direction) >= 0.0 else -normal
+        side = np.dot(normal, direction) / (np.linalg.norm(normal) * (np.linalg.norm(direction) or 1.0))
+        if abs(side) < LEAST_SIDE:
+            raise StageError(
+                f"{light.path}: the light's direction {tuple(direction)} does not say which side of its plane shines;"
+                " point it to one side"
+            )
+        direction = normal if side > 0.0 else -normal
     length = np.linalg.norm(direction)
     if length == 0.0:
         raise StageError(f"{light.path}: the light's direction is {tuple(direction)}; give it a non-zero one")

@@ -137,6 +137,7 @@ def test_threads_and_devices_to_measure():
         module.find_backends(["cuda:7"], [])
 
 
+@pytest.mark.cpu
 def test_two_backends_of_a_tiny_room(tmp_path):
     """One and two threads give the same bytes; rows are written, shown and compared with themselves."""
     file = tmp_path / "rows.jsonl"
@@ -157,6 +158,7 @@ def test_two_backends_of_a_tiny_room(tmp_path):
     assert "faster" not in result.output
 
 
+@pytest.mark.cpu
 def test_each_method_on_each_backend(tmp_path):
     """Methods repeat like stages; every row says which it is of."""
     file = tmp_path / "rows.jsonl"

@@ -58,6 +58,7 @@ def test_a_line_says_what_was_planned_and_settled():
     assert "floor" in module.format_row({"stage": "s", "budget": 1.0, "refused": "below the floor"})
 
 
+@pytest.mark.cpu
 def test_a_tiny_room_keeps_a_budget(tmp_path, monkeypatch):
     """Predictions, times and errors are in the rows; a budget below the floor is said in its line."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))

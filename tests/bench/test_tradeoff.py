@@ -112,6 +112,7 @@ def run(cache, out, *arguments: str):
     return CliRunner().invoke(bench, words, catch_exceptions=False)
 
 
+@pytest.mark.cpu
 def test_a_sweep_measures_draws_and_resumes(cache, tmp_path):
     """A stopped sweep goes on; more samples cost more and err less; flicker is measured; files are there."""
     common = ("--method", "path-trace", "--flicker", "2")

@@ -9,6 +9,8 @@ import pytest
 
 from warp_dvct.cost_model import DEFAULT_FILE, model_file
 
+pytestmark = pytest.mark.cpu  # costs of a GPU are known only once it is calibrated
+
 
 @pytest.fixture(autouse=True)
 def uncalibrated(tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ import json
 from importlib.metadata import version
 
 import click
+import pytest
 
 from warp_dvct import relighter, settings, usd_scenes
 from warp_dvct.cli import options, progress
@@ -61,6 +62,7 @@ def test_plan_lists_what_is_not_modelled(command, moving_room):
     assert "not modelled: /World/Synthetic/Crate" in command("plan", moving_room, "--camera", "Close").out
 
 
+@pytest.mark.cpu
 def test_warmup_loads_every_kernel_module(command):
     result = command("warmup")
     assert result.code == 0

@@ -22,7 +22,7 @@ from warp_dvct.kernels.geometry import (
 )
 from warp_dvct.scene import Camera, Material, Mesh, Role, Scene
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 CAMERA = Camera(np.eye(4), -0.5, 0.5, -0.5, 0.5)
 

@@ -12,7 +12,7 @@ from warp_dvct.kernels.lights import Lights, dome_radiance, light_along_ray, sam
 from warp_dvct.kernels.sampling import sobol2
 from warp_dvct.scene import Light, LightKind, LightRole
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 SAMPLES = 4096
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])  # a rotation
@@ -289,5 +289,7 @@ def test_a_black_dome_gives_nothing_and_breaks_nothing(launcher):
 def test_lights_without_area_or_direction_are_named(launcher):
     with pytest.raises(StageError, match=r"/L/Flat: the light has no area"):
         upload(launcher, replace(RECT, axis_x=(0, 0, 0), path="/L/Flat"))
+    with pytest.raises(StageError, match=r"/L/Flat: the light's direction .* does not say which side"):
+        upload(launcher, replace(RECT, direction=RECT.axis_x, path="/L/Flat"))
     with pytest.raises(StageError, match=r"/L/Sun: the light's direction"):
         upload(launcher, replace(DISTANT, direction=(0, 0, 0), path="/L/Sun"))

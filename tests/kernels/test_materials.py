@@ -23,7 +23,7 @@ from warp_dvct.kernels.materials import (
 from warp_dvct.kernels.sampling import sobol1, sobol2
 from warp_dvct.scene import Camera, Material, Mesh, Role, Scene, Texture, Wrap
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.kernel
