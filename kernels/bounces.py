@@ -199,14 +199,17 @@ def _link_patches(
     field: BounceField,
     last: PatchHits,
     rays: int,
+    parts: int,
     seed: int,
     link_out: wp.array(dtype=wp.vec2i),
     irradiance_out: wp.array(dtype=wp.vec3),
     distance_out: wp.array(dtype=wp.float32),
     triangle_out: wp.array(dtype=wp.int32),
 ):
-    """Trace a patch's rays: where they end (before, after), and the first bounce's irradiance."""
-    i = first + wp.tid()
+    """Trace one of ``parts`` parts of a patch's rays: where they end (before, after), and their share of the first
+    bounce's irradiance."""
+    i = (first + wp.tid()) / parts
+    part = (first + wp.tid()) % parts
     known = find_patch(last, patches, i)
     # Random numbers go by place, not by rank, which depends on what else there is.
     index = int(patches[i].place / wp.int64(6))
@@ -220,7 +223,7 @@ def _link_patches(
     after = wp.vec3(0.0, 0.0, 0.0)
     width = wp.sqrt(PI / float(rays))
     lift = LIFT * field.volume.voxel * float(1 << field.level)
-    for k in range(rays):
+    for k in range(rays * part / parts, rays * (part + 1) / parts):
         direction = from_frame(cosine_hemisphere(sobol2(seed, index, k, 23 + face)), normal)
         origin = spawn_point(s, direction)
         real = Hit()
@@ -254,8 +257,17 @@ def _link_patches(
             eye = origin + direction * wp.max(synthetic.t - lift, 0.5 * synthetic.t)
             link[1] = patch_at(geo, field, position, n, eye, 1)
         link_out[i * rays + k] = link
-    irradiance_out[2 * i] = before / float(rays)
-    irradiance_out[2 * i + 1] = after / float(rays)
+    irradiance_out[2 * i * parts + part] = before / float(rays)
+    irradiance_out[(2 * i + 1) * parts + part] = after / float(rays)
+
+
+@wp.kernel
+def _sum_parts(first: int, parts: int, part_in: wp.array(dtype=wp.vec3), sum_out: wp.array(dtype=wp.vec3)):
+    i = first + wp.tid()
+    total = wp.vec3()
+    for k in range(i * parts, (i + 1) * parts):
+        total += part_in[k]
+    sum_out[i] = total
 
 
 @wp.kernel

@@ -153,8 +153,8 @@ class KeptRays:
     """
 
     present: wp.int32  # 0: nothing is kept, the arrays are empty
-    point: wp.array(dtype=wp.int32)  # [slots], -1 at first
-    count: wp.array(dtype=wp.int32)  # [slots], how many of its rays are kept
+    point: wp.array(dtype=wp.int32)  # [slots * parts], -1 at first
+    count: wp.array(dtype=wp.int32)  # [slots * parts], how many of its rays are kept
     reach: wp.array(dtype=wp.float32)  # [slots * rays], hit distance
     triangle: wp.array(dtype=wp.int32)  # [slots * rays], -1 where the ray meets nothing
 
@@ -263,7 +263,7 @@ def inverse_distance(light: Incident) -> float:
 
 @wp.func
 def gather_at(
-    i: int,
+    part: wp.vec3i,
     j: int,
     points: Points,
     geo: Geometry,
@@ -277,8 +277,12 @@ def gather_at(
     seed: int,
     kept_out: KeptRays,
 ) -> Gathered:
-    """Of the rays of point ``j``, the ``i``-th that is gathered; ``hits``: ``GlossyHits`` or ``Lambertian``."""
+    """Of point ``j``'s rays, those of a part: the gathered point's number, the part's, and how many parts there are.
+
+    ``hits``: ``GlossyHits`` or ``Lambertian``.
+    """
     total = Gathered()
+    slot = part[0] * part[2] + part[1]
     s = load_surface(points, j)
     even = share_of(rays, points, j, edge_samples)
     aim = aim_at(targets, s, int(float(even) * aimed))
@@ -287,11 +291,12 @@ def gather_at(
     known = False
     if kept_out.present != 0:
         # As many even rays as before are the same rays: their numbers start by how many there are.
-        known = kept_out.point[i] == j and kept_out.count[i] == even
-        kept_out.point[i] = j
-        kept_out.count[i] = even
+        known = kept_out.point[slot] == j and kept_out.count[slot] == even
+        kept_out.point[slot] = j
+        kept_out.count[slot] = even
     start = first_sample(even * pixel_points(points, j, edge_samples), even, stride, points, j)
-    for k in range(even + aim.rays):
+    count = even + aim.rays
+    for k in range(count * part[1] / part[2], count * (part[1] + 1) / part[2]):
         disk = wp.vec2()
         drawn = int(-1)
         if k < even:
@@ -304,7 +309,7 @@ def gather_at(
         ray = ray_over(s, disk, weight)
         if ray.up != 0:
             keeps = kept_out.present != 0 and k < even
-            at = i * rays + k
+            at = part[0] * rays + k
             ray.real = kept_real(kept_out, keeps, keeps and known, at, geo, ray.origin, ray.direction)
             ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
             light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
@@ -329,7 +334,7 @@ def _gather_rays(
     geo: Geometry,
     world: World,
     targets: Targets,
-    turn: wp.vec3i,
+    turn: wp.vec4i,
     rays: int,
     aimed: float,
     edge_samples: int,
@@ -343,24 +348,28 @@ def _gather_rays(
     """Irradiance [W m^-2] from indirect light and domes, by exact rays (eq. 6's integral).
 
     They are cosine-distributed, and fewer but partly aimed at the synthetic objects where ``aimed`` is above 0 and
-    these take up little of the view (``kernels.aim``). ``turn`` has its number, how many there are, and how many points
-    in all of them. ``stride`` is the spacing of the gathered points in pixels; a pixel's ``edge_samples`` points share
-    its rays out. ``nearness_out`` is the mean inverse distance of what the rays met.
+    these take up little of the view (``kernels.aim``). ``turn`` has its number, how many there are, how many points in
+    all of them, and how many parts a point's rays are gathered in, each of which writes its share. ``stride`` is the
+    spacing of the gathered points in pixels; a pixel's ``edge_samples`` points share its rays out. ``nearness_out`` is
+    the mean inverse distance of what the rays met.
     """
-    i = of_turn(first + wp.tid(), turn[0], turn[1])
+    t = first + wp.tid()
+    i = of_turn(t / turn[3], turn[0], turn[1])
     if i >= turn[2]:
         return
+    part = wp.vec3i(i, t % turn[3], turn[3])
     j = index_in[i]
     total = Gathered()
     if j >= 0:
         if points.role[j] != BACKGROUND:
             hits = Lambertian()
             total = gather_at(
-                i, j, points, geo, world, hits, targets, rays, aimed, edge_samples, stride, seed, kept_out
+                part, j, points, geo, world, hits, targets, rays, aimed, edge_samples, stride, seed, kept_out
             )
-    before_out[i] = total.before
-    after_out[i] = total.after
-    nearness_out[i] = total.nearness
+    at = i * turn[3] + part[1]
+    before_out[at] = total.before
+    after_out[at] = total.after
+    nearness_out[at] = total.nearness
 
 
 @wp.kernel
@@ -372,7 +381,7 @@ def _gather_rays_glossy(
     world: World,
     hits: GlossyHits,
     targets: Targets,
-    turn: wp.vec3i,
+    turn: wp.vec4i,
     rays: int,
     aimed: float,
     edge_samples: int,
@@ -384,19 +393,47 @@ def _gather_rays_glossy(
     nearness_out: wp.array(dtype=wp.float32),
 ):
     """As ``_gather_rays``, where what rays meet may be glossy: apart, because it takes three times the registers."""
-    i = of_turn(first + wp.tid(), turn[0], turn[1])
+    t = first + wp.tid()
+    i = of_turn(t / turn[3], turn[0], turn[1])
     if i >= turn[2]:
         return
+    part = wp.vec3i(i, t % turn[3], turn[3])
     j = index_in[i]
     total = Gathered()
     if j >= 0:
         if points.role[j] != BACKGROUND:
             total = gather_at(
-                i, j, points, geo, world, hits, targets, rays, aimed, edge_samples, stride, seed, kept_out
+                part, j, points, geo, world, hits, targets, rays, aimed, edge_samples, stride, seed, kept_out
             )
-    before_out[i] = total.before
-    after_out[i] = total.after
-    nearness_out[i] = total.nearness
+    at = i * turn[3] + part[1]
+    before_out[at] = total.before
+    after_out[at] = total.after
+    nearness_out[at] = total.nearness
+
+
+@wp.kernel
+def _sum_parts(
+    first: int,
+    parts: int,
+    before_in: wp.array(dtype=wp.vec3),
+    after_in: wp.array(dtype=wp.vec3),
+    nearness_in: wp.array(dtype=wp.float32),
+    before_out: wp.array(dtype=wp.vec3),
+    after_out: wp.array(dtype=wp.vec3),
+    nearness_out: wp.array(dtype=wp.float32),
+):
+    """Points' irradiance and nearness, of those of the parts of their rays."""
+    i = first + wp.tid()
+    before = wp.vec3()
+    after = wp.vec3()
+    nearness = float(0.0)
+    for k in range(i * parts, (i + 1) * parts):
+        before += before_in[k]
+        after += after_in[k]
+        nearness += nearness_in[k]
+    before_out[i] = before
+    after_out[i] = after
+    nearness_out[i] = nearness
 
 
 @wp.kernel

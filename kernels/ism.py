@@ -240,14 +240,18 @@ def splat(ism: Ism, start: int, v: wp.vec3, m: wp.vec3, radius: float):
                 if wp.abs(facing) > STEEPEST:
                     depth = plane / facing
                     if depth > 0.0 and wp.length_sq(direction * depth - v) <= radius2:
-                        at = start + y * ism.size + x
-                        ism.inverse[at] = wp.max(ism.inverse[at], 1.0 / depth)
+                        # Of the parts of a map's points, whichever comes first: the nearest stays.
+                        wp.atomic_max(ism.inverse, start + y * ism.size + x, 1.0 / depth)
 
 
 @wp.kernel
-def _splat_points(first: int, map_first: int, vpls: Vpls, real: Cloud, synthetic: Cloud, grow: float, ism: Ism):
-    """One map, all by one thread: the points of the VPL's block, as discs grown by ``grow``."""
-    i = map_first + first + wp.tid()
+def _splat_points(
+    first: int, map_first: int, parts: int, vpls: Vpls, real: Cloud, synthetic: Cloud, grow: float, ism: Ism
+):
+    """One of ``parts`` parts of the points of a VPL's block, as discs grown by ``grow``. On the CPU there is one, whose
+    thread has the map to itself: atomic functions are not atomic there."""
+    part = (first + wp.tid()) % parts
+    i = map_first + (first + wp.tid()) / parts
     k = ism.first + i / 2
     cloud = real
     if i % 2 == 1:
@@ -257,7 +261,7 @@ def _splat_points(first: int, map_first: int, vpls: Vpls, real: Cloud, synthetic
     start = i * ism.stride
     axis = vpls.normal[k]
     offset = (k % (cloud.count / cloud.block)) * cloud.block
-    for j in range(offset, offset + cloud.block):
+    for j in range(offset + cloud.block * part / parts, offset + cloud.block * (part + 1) / parts):
         radius = cloud.radius[j] * grow
         m = local_to(cloud.normal[j], axis)
         v = local_to(cloud.position[j] - vpls.position[k], axis)

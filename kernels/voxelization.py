@@ -281,7 +281,7 @@ def _count_fragments(
 
 
 @wp.kernel
-def _cut_fragments(
+def _list_fragments(
     first: int,
     corners_in: wp.array(dtype=wp.vec3),
     tile_triangle_in: wp.array(dtype=wp.int32),
@@ -293,42 +293,53 @@ def _cut_fragments(
     n: int,
     key_out: wp.array(dtype=wp.int32),
     triangle_out: wp.array(dtype=wp.int32),
-    fragment_out: wp.array(dtype=wp.vec4),
 ):
-    """Fragments of a triangle in a tile: centroid in volume space and area in voxel faces.
-
-    A triangle in the plane between two voxels is met by both; it belongs to the upper one, as cubes are half open. What
-    was listed and not cut gets ``EMPTY_KEY``.
-    """
+    """The voxels that ``_count_fragments`` counts."""
     i = first + wp.tid()
     at = end_in[i] - count_in[i]
     index = tile_triangle_in[i]
     triangle = load_triangle(corners_in, index, low, voxel)
     bricks = brick_extent(n, 0)
-    start = tile_cell(tile_in[i], bricks)
-    span = voxel_span(triangle, start, n)
-    least = wp.min(SLIVER, 0.5 * SLIVER_SHARE * wp.length(triangle.normal))
+    span = voxel_span(triangle, tile_cell(tile_in[i], bricks), n)
     for z in range(span.low[2], span.high[2] + 1):
         for y in range(span.low[1], span.high[1] + 1):
             for x in range(span.low[0], span.high[0] + 1):
-                corner = wp.vec3(float(x), float(y), float(z))
-                if overlaps(triangle, corner, 1.0):
-                    moments = polygon_moments(cut_triangle(triangle, corner))
-                    centroid = wp.vec3(moments[0], moments[1], moments[2])
-                    mine = moments[3] > least
-                    for axis in range(3):
-                        # The outermost voxels are closed on the far side too: a wall may lie on the box's border.
-                        index_along = wp.where(axis == 0, x, wp.where(axis == 1, y, z))
-                        if triangle.low[axis] >= corner[axis] + 1.0 and index_along < n - 1:
-                            mine = False
-                    key = EMPTY_KEY
-                    if mine:
-                        key = cell_key(x, y, z, bricks)
-                    key_out[at] = key
+                if overlaps(triangle, wp.vec3(float(x), float(y), float(z)), 1.0):
+                    key_out[at] = cell_key(x, y, z, bricks)
                     triangle_out[at] = index
-                    position = low + (corner + centroid) * voxel
-                    fragment_out[at] = wp.vec4(position[0], position[1], position[2], moments[3])
                     at += 1
+
+
+@wp.kernel
+def _cut_fragments(
+    first: int,
+    corners_in: wp.array(dtype=wp.vec3),
+    triangle_in: wp.array(dtype=wp.int32),
+    low: wp.vec3,
+    voxel: float,
+    n: int,
+    key_out: wp.array(dtype=wp.int32),
+    fragment_out: wp.array(dtype=wp.vec4),
+):
+    """A triangle's fragment in a listed voxel: centroid in volume space and area in voxel faces.
+
+    A triangle in the plane between two voxels is met by both; it belongs to the upper one, as cubes are half open. What
+    was listed and not cut gets ``EMPTY_KEY``.
+    """
+    i = first + wp.tid()
+    triangle = load_triangle(corners_in, triangle_in[i], low, voxel)
+    cell = key_cell(key_out[i], brick_extent(n, 0))
+    corner = wp.vec3(float(cell[0]), float(cell[1]), float(cell[2]))
+    moments = polygon_moments(cut_triangle(triangle, corner))
+    mine = moments[3] > wp.min(SLIVER, 0.5 * SLIVER_SHARE * wp.length(triangle.normal))
+    for axis in range(3):
+        # The outermost voxels are closed on the far side too: a wall may lie on the box's border.
+        if triangle.low[axis] >= corner[axis] + 1.0 and cell[axis] < n - 1:
+            mine = False
+    if not mine:
+        key_out[i] = EMPTY_KEY
+    position = low + (corner + wp.vec3(moments[0], moments[1], moments[2])) * voxel
+    fragment_out[i] = wp.vec4(position[0], position[1], position[2], moments[3])
 
 
 @wp.kernel

@@ -63,10 +63,11 @@ def solve_bounces(
     key = (patches.voxels.box, patches.level, rays, seed)
     hits = _patch_hits(launcher, patches, rays)
     links = launcher.empty(max(1, count * rays), wp.vec2i)
-    last = launcher.zeros(max(1, 2 * count), wp.vec3)
+    last, parts = launcher.zeros(max(1, 2 * count), wp.vec3), launcher.parts
+    shares = last if parts == 1 else launcher.empty(max(1, 2 * count * parts), wp.vec3)
     launcher.launch(
         kernels._link_patches,
-        count,
+        count * parts,
         [
             scene.geometry,
             world,
@@ -74,10 +75,13 @@ def solve_bounces(
             bounce_field(launcher, patches, last),
             kept.last(PATCH_HITS, key) or kernels.PatchHits(),
             rays,
+            parts,
             seed,
         ],
-        [links, last, hits.distance, hits.triangle],
+        [links, shares, hits.distance, hits.triangle],
     )
+    if parts > 1:
+        launcher.launch(kernels._sum_parts, 2 * count, [parts, shares], [last])
     kept.put(PATCH_HITS, key, hits)
     total = launcher.empty(max(1, 2 * count), wp.vec3)
     wp.copy(total, last)

@@ -101,11 +101,15 @@ class Gatherer:
         kernel = kernels._gather_rays if self.hits is None else kernels._gather_rays_glossy
         if self.hits is not None:
             shared.append(self.hits)
+        parts = launcher.parts
+        outputs = [before, after, nearness]
+        if parts > 1:
+            outputs = [launcher.empty(max(1, count * parts), array.dtype) for array in outputs]
         turns = [Turn(0, 1, self.rays)] if self.turns is None else self.turns.take(launcher, part, count)
         for turn in turns:
             how = [
                 self.scene.targets,
-                wp.vec3i(turn.number, turn.of, count),
+                wp.vec4i(turn.number, turn.of, count, parts),
                 turn.rays,
                 self.aimed,
                 self.edge_samples,
@@ -114,8 +118,10 @@ class Gatherer:
                 keep_rays(launcher, 0, 0) if kept is None or self.turns is not None else kept,
             ]
             runs = -(-count // kernels.RUN)
-            elements = -(-runs // turn.of) * kernels.RUN
-            launcher.launch(kernel, elements, [*shared, *how], [before, after, nearness])
+            elements = -(-runs // turn.of) * kernels.RUN * parts
+            launcher.launch(kernel, elements, [*shared, *how], outputs)
+        if parts > 1:
+            launcher.launch(kernels._sum_parts, count, [parts, *outputs], [before, after, nearness])
         return before, after
 
 
@@ -123,8 +129,8 @@ def keep_rays(launcher: Launcher, slots: int, rays: int) -> Any:
     """Empty ``KeptRays``; with no slots, the one that keeps nothing."""
     kept = kernels.KeptRays()
     kept.present = int(slots > 0)
-    kept.point = launcher.full(max(1, slots), -1, wp.int32)
-    kept.count = launcher.zeros(max(1, slots), wp.int32)
+    kept.point = launcher.full(max(1, slots * launcher.parts), -1, wp.int32)
+    kept.count = launcher.zeros(max(1, slots * launcher.parts), wp.int32)
     kept.reach = launcher.empty(max(1, slots * rays), wp.float32)
     kept.triangle = launcher.empty(max(1, slots * rays), wp.int32)
     return kept

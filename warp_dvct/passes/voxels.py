@@ -164,12 +164,9 @@ def cut_triangles(launcher: Launcher, triangles: Any, box: Box) -> Pieces:
     order = launcher.empty(max(2 * listed, 1), wp.int32)
     cut_triangle = launcher.empty(max(listed, 1), wp.int32)
     cut_place = launcher.empty(max(listed, 1), wp.vec4)
-    launcher.launch(
-        kernels._cut_fragments,
-        total,
-        [triangles, tile_triangle, tile, ends, per_tile, *grid],
-        [cut_key, cut_triangle, cut_place],
-    )
+    tiles = [triangles, tile_triangle, tile, ends, per_tile]
+    launcher.launch(kernels._list_fragments, total, [*tiles, *grid], [cut_key, cut_triangle])
+    launcher.launch(kernels._cut_fragments, listed, [triangles, cut_triangle, *grid], [cut_key, cut_place])
     sort_by_key(launcher, cut_key, order, listed)
     valid = count_below(launcher, cut_key, listed)
     key, triangle = launcher.empty(max(valid, 1), wp.int32), launcher.empty(max(valid, 1), wp.int32)
