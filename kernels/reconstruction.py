@@ -27,26 +27,30 @@ def _choose_points(
     height: int,
     stride: int,
     columns: int,
+    window: wp.vec4i,
     role: int,
     seed: int,
     gathered_out: Gathered,
 ):
     """The pixel that stands for a ``stride`` x ``stride`` block: a hashed one if it has the role, else the next that
-    has; -1 where none has."""
+    has; -1 where none has. None has outside of ``window``: first and last column, first and last row."""
     i = first + wp.tid()
     bx = (i % columns) * stride
     by = (i / columns) * stride
     cells = stride * stride
+    if bx > window[1] or bx + stride <= window[0] or by > window[3] or by + stride <= window[2]:
+        cells = 0
     start = int(uniform1(seed, i, 0, 7) * float(cells))
     found = int(-1)
-    for k in range(cells):
-        if found < 0:
-            cell = (start + k) % cells
-            x = bx + cell % stride
-            y = by + cell / stride
-            if x < width and y < height:
-                if points.role[y * width + x] == role:
-                    found = y * width + x
+    tried = int(0)
+    while found < 0 and tried < cells:
+        cell = (start + tried) % cells
+        x = bx + cell % stride
+        y = by + cell / stride
+        if x < width and y < height:
+            if points.role[y * width + x] == role:
+                found = y * width + x
+        tried += 1
     gathered_out.choice[i] = found
     if found >= 0:
         gathered_out.center[i] = wp.vec2(float(found % width) + 0.5, float(found / width) + 0.5)

@@ -58,7 +58,7 @@ def test_objects_that_went_are_taken_out(launcher):
         return lit.upload(launcher, lit.scene_of(lit.mesh(lit.room(2.0)), box, camera=camera))
 
     before, after = upload(-0.2), upload(0.2)
-    view = gbuffer.new_view(launcher, before, 60, 40)
+    view = gbuffer.new_view(launcher, before, 60, 40, 4)
     for scene in (before, after):
         moved = gbuffer.render_gbuffer(launcher, scene, 60, 40, edge_samples=2, behind=False, view=view)
     fresh = gbuffer.render_gbuffer(launcher, after, 60, 40, edge_samples=2, behind=False)

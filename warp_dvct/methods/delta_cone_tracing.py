@@ -127,7 +127,9 @@ def render(
         if kept is not None:
             key = content_key(scene.camera, plan.width, plan.height)
             view = kept.get(
-                "camera's real hits", key, lambda: new_view(launcher, device_scene, plan.width, plan.height)
+                "camera's real hits",
+                key,
+                lambda: new_view(launcher, device_scene, plan.width, plan.height, settings.antialias),
             )
         buffer = render_gbuffer(
             launcher,

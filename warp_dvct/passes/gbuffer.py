@@ -14,7 +14,7 @@ from warp_dvct.kernels.gbuffer import Points
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.sorting import scan
 
-EDGE_SHARE = 8  # room for one edge point in so many pixels is there from the start, and saves most pictures a copy
+EDGE_SHARE = 20  # room for one edge pixel in so many is there from the start, and saves most pictures a copy
 WINDOW_MARGIN = 1e-6  # of the farthest corner of a box: depths below are not told from 0
 
 
@@ -25,6 +25,7 @@ class GBuffer:
     Attributes:
         points: ``Points``: entry ``p`` is pixel ``p``'s centre; then ``edge_samples`` points per edge pixel.
         count: Points in all.
+        window: First and last column, first and last row that may show synthetic surfaces.
         edge_rank: int ``[width * height]``, rank of an edge pixel or -1. Edge pixel of rank ``r`` owns points
             ``width * height + r * edge_samples`` and on; a pixel without an edge is its centre alone.
         behind: ``Points``: real surfaces behind the synthetic points, or None where they were not asked for.
@@ -38,6 +39,7 @@ class GBuffer:
     edge_samples: int
     points: Any
     count: int
+    window: tuple[int, int, int, int]
     edge_rank: Any
     edge_pixel: Any
     behind: Any
@@ -92,9 +94,9 @@ def objects_window(scene: DeviceScene, width: int, height: int) -> tuple[int, in
     return int(columns[0]), int(columns[1]), int(rows[0]), int(rows[1])
 
 
-def new_view(launcher: Launcher, scene: DeviceScene, width: int, height: int) -> View:
-    """The real scene alone, with room for the edges of most pictures."""
-    return see_real(launcher, scene, width, height, edge_room=width * height // EDGE_SHARE)
+def new_view(launcher: Launcher, scene: DeviceScene, width: int, height: int, edge_samples: int) -> View:
+    """The real scene alone, with room for the edges of most pictures at ``edge_samples`` points an edge pixel."""
+    return see_real(launcher, scene, width, height, edge_room=width * height * edge_samples // EDGE_SHARE)
 
 
 def render_gbuffer(
@@ -120,9 +122,10 @@ def render_gbuffer(
     """
     pixels = width * height
     shared = [scene.geometry, scene.materials, scene.camera]
-    view = view or new_view(launcher, scene, width, height)
-    window = wp.vec4i(*objects_window(scene, width, height))
-    launcher.launch(kernels._see_synthetic, pixels, [*shared, view.reach, window, width, height], [view.points])
+    view = view or new_view(launcher, scene, width, height, edge_samples)
+    window = objects_window(scene, width, height)
+    inputs = [*shared, view.reach, wp.vec4i(*window), width, height]
+    launcher.launch(kernels._see_synthetic, pixels, inputs, [view.points])
     mark = launcher.zeros(pixels, wp.int32)
     if edge_samples > 0:
         launcher.launch(kernels._mark_edges, pixels, [view.points, width, height, int(paint)], [mark])
@@ -136,7 +139,7 @@ def render_gbuffer(
     hidden: tuple[Any, Any, Any, int] = (None, None, None, 0)
     if behind:
         hidden = _look_behind(launcher, scene, points, count, width)
-    return GBuffer(width, height, edge_samples, points, count, edge_rank, edge_pixel, *hidden)
+    return GBuffer(width, height, edge_samples, points, count, window, edge_rank, edge_pixel, *hidden)
 
 
 def compact(launcher: Launcher, mark: Any) -> tuple[Any, Any, int]:
