@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from warp_dvct import Relighter
 from warp_dvct.bench.motion import same
+from warp_dvct.launch import Launcher
 from warp_dvct.scene import Role, Scene
 from warp_dvct.usd.read import read_stage
 from warp_dvct.usd_scenes import path
@@ -19,7 +21,7 @@ PARTS = 5  # divides neither the rays nor the points of a map
 def relighter(scene: Scene, parts: int, method: str = "delta-cones", **settings: object) -> Relighter:
     """At a tiny size, on one thread: atomic functions are not atomic on several."""
     made = Relighter(scene, method=method, quality="draft", width=64, threads=1, settings=settings)
-    made._launcher.parts = parts
+    made._launcher.parts = lambda count: parts
     return made
 
 
@@ -59,3 +61,12 @@ def test_shadow_maps_drawn_in_parts_are_the_same_maps():
     whole, parted = (relighter(scene, parts, "instant-radiosity", **knobs).render() for parts in (1, PARTS))
     assert np.abs(whole.delta).max() > 0.05
     assert same(whole, parted)
+
+
+@pytest.mark.cpu
+def test_many_points_are_enough_for_a_gpu():
+    """What parts write of all points stays within 2^20 entries; the CPU has one part."""
+    gpu = SimpleNamespace(device=SimpleNamespace(is_cuda=True))
+    counts = (0, 1, 3600, 2**15, 2**18, 2**20, 2**22)
+    assert [Launcher.parts(gpu, count) for count in counts] == [32, 32, 32, 32, 4, 1, 1]
+    assert Launcher("cpu").parts(1) == 1

@@ -27,6 +27,7 @@ SLABS_PER_THREAD = 8  # enough that an uneven slab does not leave the other thre
 MIN_SLAB_SECONDS = 1.0e-4  # less work is not worth handing to another thread
 FIRST_GUESS = 1.0e-6  # seconds an element, of a kernel that has not run
 PARTS_CUDA = 32  # of a point's rays or a map's splats: a GPU wants more threads than there are points, and short ones
+THREADS_CUDA = 2**20  # beyond which more parts would fill memory and not the GPU
 KEPT_BYTES_CUDA = 2**30  # freed memory that is kept for the next arrays: to return it and ask again takes 0.1 ms each
 FORGETTING = 0.7  # of the dearest launch so far, per launch: kernels are launched with light and heavy elements in turn
 
@@ -41,8 +42,6 @@ class Launcher:
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
         threads: CPU threads for slab launches; None for all cores that this process may use. Ignored on CUDA.
         check: Whether to look at what every launch wrote (``warp_dvct.check``).
-    Attributes:
-        parts: Elements that share out a point's rays, or a map's splats: 1 on the CPU.
     Raises:
         DeviceError: The device is not present.
         OptionError: ``threads`` is below 1.
@@ -53,7 +52,6 @@ class Launcher:
         if threads is not None and threads < 1:
             raise OptionError(f"threads is {threads}; give a number of at least 1")
         self.threads = 1 if self.device.is_cuda else (threads or len(os.sched_getaffinity(0)))
-        self.parts = PARTS_CUDA if self.device.is_cuda else 1
         if self.device.is_cuda and self.device.is_mempool_enabled:
             wp.set_mempool_release_threshold(self.device, KEPT_BYTES_CUDA)
         self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
@@ -114,6 +112,10 @@ class Launcher:
             # After an interrupt the caller frees its arrays: no slab may still be writing to them.
             waiting.clear()
             wait(workers)
+
+    def parts(self, count: int) -> int:
+        """Elements that share out the rays of one of ``count`` points, or a map's splats: 1 on the CPU."""
+        return max(1, min(PARTS_CUDA, THREADS_CUDA // max(1, count))) if self.device.is_cuda else 1
 
     def _scope_name(self) -> str:
         return self._scopes[-1][0] if self._scopes else "loading the scene"

@@ -63,7 +63,7 @@ def solve_bounces(
     key = (patches.voxels.box, patches.level, rays, seed)
     hits = _patch_hits(launcher, patches, rays)
     links = launcher.empty(max(1, count * rays), wp.vec2i)
-    last, parts = launcher.zeros(max(1, 2 * count), wp.vec3), launcher.parts
+    last, parts = launcher.zeros(max(1, 2 * count), wp.vec3), launcher.parts(count)
     shares = last if parts == 1 else launcher.empty(max(1, 2 * count * parts), wp.vec3)
     launcher.launch(
         kernels._link_patches,

@@ -101,7 +101,7 @@ class Gatherer:
         kernel = kernels._gather_rays if self.hits is None else kernels._gather_rays_glossy
         if self.hits is not None:
             shared.append(self.hits)
-        parts = launcher.parts
+        parts = launcher.parts(count)
         outputs = [before, after, nearness]
         if parts > 1:
             outputs = [launcher.empty(max(1, count * parts), array.dtype) for array in outputs]
@@ -129,8 +129,8 @@ def keep_rays(launcher: Launcher, slots: int, rays: int) -> Any:
     """Empty ``KeptRays``; with no slots, the one that keeps nothing."""
     kept = kernels.KeptRays()
     kept.present = int(slots > 0)
-    kept.point = launcher.full(max(1, slots * launcher.parts), -1, wp.int32)
-    kept.count = launcher.zeros(max(1, slots * launcher.parts), wp.int32)
+    kept.point = launcher.full(max(1, slots * launcher.parts(slots)), -1, wp.int32)
+    kept.count = launcher.zeros(max(1, slots * launcher.parts(slots)), wp.int32)
     kept.reach = launcher.empty(max(1, slots * rays), wp.float32)
     kept.triangle = launcher.empty(max(1, slots * rays), wp.int32)
     return kept

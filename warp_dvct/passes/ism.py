@@ -46,8 +46,8 @@ def draw_isms(
     """
     ism = sight.ism
     maps, first = 2 * count, 2 * (start - ism.first)
-    clouds = [vpls, points.real, points.synthetic]
-    launcher.launch(kernels._splat_points, maps * launcher.parts, [first, launcher.parts, *clouds, grow, ism])
+    parts, clouds = launcher.parts(maps), [points.real, points.synthetic]
+    launcher.launch(kernels._splat_points, maps * parts, [first, parts, vpls, *clouds, grow, ism])
     for level in range(1, ism.levels):
         launcher.launch(kernels._pull, maps * (ism.size >> level) ** 2, [first, ism, level], [ism.inverse])
     for level in range(ism.levels - 2, -1, -1):
