@@ -5,7 +5,8 @@ import warp as wp
 from warp_dvct.kernels.bounce_field import BounceField, bounced_irradiance
 from warp_dvct.kernels.cones import ConeSettings
 from warp_dvct.kernels.environment import environment_radiance
-from warp_dvct.kernels.gather import cone_incident, diffuse_reflectance, hit_incident, inverse_distance, ray_incident
+from warp_dvct.kernels.gather import diffuse_reflectance, hit_incident, inverse_distance, ray_incident
+from warp_dvct.kernels.gather_cones import cone_incident
 from warp_dvct.kernels.gbuffer import BACKGROUND, UNSEEN, Points, first_sample, load_surface, share_of
 from warp_dvct.kernels.geometry import (
     FAR,

@@ -22,7 +22,7 @@ from warp_dvct.bench.twins.numbers import (
 )
 from warp_dvct.bench.twins.stage import Twin
 from warp_dvct.bench.twins.volumes import N, fields, lit
-from warp_dvct.kernels import bounces, cones, gather, reconstruction, specular
+from warp_dvct.kernels import bounces, cones, gather, gather_cones, reconstruction, specular
 from warp_dvct.kernels.bounce_field import Patch
 from warp_dvct.kernels.environment import Environment
 from warp_dvct.kernels.gbuffer import Points
@@ -141,7 +141,7 @@ def measure_cones(launcher: Any) -> list[Deviation]:
         aperture = 2.0 * np.arccos(1.0 - min(0.5 / (CONES * max(cos, 0.1)), 1.0))
         direction = from_frame(local, normal)
         total += march(levels, position + normal * 1.5 / N, direction, aperture)[..., :3] / CONES
-    kernel = gather._gather_cones
+    kernel = gather_cones._gather_cones
     return [compare(kernel, name, got[s].numpy(), total[:, s]) for s, name in enumerate(("before", "after"))]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_dvct.device_scene import DeviceScene
-from warp_dvct.kernels import changed_detail, reconstruction
+from warp_dvct.kernels import changed_detail, gather_cones, reconstruction
 from warp_dvct.kernels import gather as kernels
 from warp_dvct.kernels.glossy_hits import FOCUSING, GlossyHits
 from warp_dvct.launch import Launcher
@@ -96,7 +96,7 @@ class Gatherer:
         shared = [points, index, self.scene.geometry, self.world]
         if self.cone is not None:
             how = [self.cones, self.cone, int(self.with_before), self.seed]
-            launcher.launch(kernels._gather_cones, count, [*shared, *how], [before, after])
+            launcher.launch(gather_cones._gather_cones, count, [*shared, *how], [before, after])
             return before, after
         kernel = kernels._gather_rays if self.hits is None else kernels._gather_rays_glossy
         if self.hits is not None:
