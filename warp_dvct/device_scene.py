@@ -24,7 +24,8 @@ from warp_dvct.targets import targets_of
 
 # A closed mesh may be met from behind by the odd ray that slips through an edge; this many are no accident.
 BACKS_MET = 4
-LEAST_SIDE = 1e-6  # sine of the angle between a flat light's plane and its direction, below which it has no side
+# Sine of the angle between a flat light's plane and its direction, below which float32 axes do not tell the side.
+LEAST_SIDE = 1e-6
 BOX_MARGIN = 1e-3  # of the largest edge of the box around the objects: keeps rounding from culling a ray at its border
 
 

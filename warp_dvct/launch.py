@@ -3,6 +3,8 @@
 This is the only caller of ``wp.launch``. A Warp launch on the CPU runs on one thread, so :meth:`Launcher.launch` cuts
 the index range into slabs and hands them to a pool. Kernels therefore take ``first: int`` as their first argument and
 work on element ``first + wp.tid()``; each writes only what that element owns, so results do not depend on the slabs.
+On a GPU, where one thread for each point would leave most of it idle, :meth:`Launcher.parts` elements share a point's
+work: each writes its own sum, or a maximum that is atomic there and does not depend on the order.
 """
 
 from __future__ import annotations
