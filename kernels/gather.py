@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_dvct.kernels.aim import Targets, aim_at, ray_weight, sector_point
+from warp_dvct.kernels.aim import NUMBERS, Targets, aim_at, ray_weight, sector_point
 from warp_dvct.kernels.environment import environment_radiance
 from warp_dvct.kernels.gbuffer import (
     BACKGROUND,
@@ -215,9 +215,10 @@ def gather_at(
     slot = part[0] * part[2] + part[1]
     s = load_surface(points, j)
     even = share_of(rays, points, j, edge_samples)
-    aim = aim_at(targets, s, int(float(even) * aimed))
+    few = int(float(even) * aimed)
+    aim = aim_at(targets, s, few)
     if aim.rays > 0:
-        even = aim.rays
+        even = few
     known = False
     if kept_out.present != 0:
         # As many even rays as before are the same rays: their numbers start by how many there are.
@@ -232,7 +233,7 @@ def gather_at(
         if k < even:
             disk = concentric_disk(sobol2(seed, 0, start + k, 11))
         else:
-            xi = sobol2(seed, 0, start + k - even, 12)
+            xi = sobol2(seed, 0, start * NUMBERS + k - even, 12)
             drawn = wp.where(k - even < aim.first, 0, 1)
             disk = sector_point(wp.where(drawn == 0, aim.sector, aim.other), xi)
         weight = ray_weight(aim, even, disk, drawn)
@@ -277,11 +278,11 @@ def _gather_rays(
 ):
     """Irradiance [W m^-2] from indirect light and domes, by exact rays (eq. 6's integral).
 
-    They are cosine-distributed, and fewer but partly aimed at the synthetic objects where ``aimed`` is above 0 and
-    these take up little of the view (``kernels.aim``). ``turn`` has its number, how many there are, how many points in
-    all of them, and how many parts a point's rays are gathered in, each of which writes its share. ``stride`` is the
-    spacing of the gathered points in pixels; a pixel's ``edge_samples`` points share its rays out. ``nearness_out`` is
-    the mean inverse distance of what the rays met.
+    They are cosine-distributed. Where the synthetic objects take up little of the view, only a share ``aimed`` of them
+    is, if that is not 0, and others are aimed at the objects (``kernels.aim``). ``turn`` has its number, how many there
+    are, how many points in all of them, and how many parts a point's rays are gathered in, each of which writes its
+    share. ``stride`` is the spacing of the gathered points in pixels; a pixel's ``edge_samples`` points share its rays
+    out. ``nearness_out`` is the mean inverse distance of what the rays met.
     """
     t = first + wp.tid()
     i = of_turn(t / turn[3], turn[0], turn[1])

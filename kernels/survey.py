@@ -10,6 +10,8 @@ from warp_dvct.kernels.sampling import cosine_hemisphere, from_frame, sobol2
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
+EVEN = wp.constant(64)  # rays, to tell how many are aimed for each
+
 
 @wp.func
 def enters(low: wp.vec3, high: wp.vec3, origin: wp.vec3, direction: wp.vec3, reach: float) -> bool:
@@ -39,16 +41,16 @@ def _look_around(
     met_out: wp.array(dtype=wp.int32),
     entered_out: wp.array(dtype=wp.int32),
     nearness_out: wp.array(dtype=wp.float32),
-    aimed_out: wp.array(dtype=wp.int32),
+    toward_out: wp.array(dtype=wp.float32),
 ):
     """Of a point's cosine-distributed rays, how many meet anything (-1 where there is no surface), how many pass the
     synthetic objects' box before they meet something real, and the mean inverse distance of what they meet; and
-    whether the objects take up so little of its view that rays are aimed at them (1 or 0)."""
+    how many rays are aimed at the objects for each even one (0 where they take up too much of its view)."""
     i = first + wp.tid()
     j = index_in[i]
     entered_out[i] = 0
     nearness_out[i] = 0.0
-    aimed_out[i] = 0
+    toward_out[i] = 0.0
     if points.role[j] == BACKGROUND:
         met_out[i] = -1
         return
@@ -69,4 +71,4 @@ def _look_around(
     met_out[i] = met
     entered_out[i] = entered
     nearness_out[i] = nearness / float(rays)
-    aimed_out[i] = aim_at(targets, s, 1).rays
+    toward_out[i] = float(aim_at(targets, s, EVEN).rays) / float(EVEN)

@@ -17,6 +17,7 @@ from warp_dvct.calibrate import calibrate, subdivide
 from warp_dvct.cost import FIRST_RAYS, count_work
 from warp_dvct.cost_model import Sample, fit, load_model, model_file, non_negative, save_model
 from warp_dvct.errors import FileError, OptionError
+from warp_dvct.kernels.survey import EVEN
 from warp_dvct.launch import Launcher
 from warp_dvct.scene import PointCloud, Role
 from warp_dvct.settings import NAMES, make_settings
@@ -129,10 +130,12 @@ def test_gathered_rays_are_those_of_a_frame(surveys, counted_gathers, stage, str
 
 @pytest.mark.parametrize("stage", ["room_area", "room_glossy", "ground_dome"])
 def test_aimed_points_are_those_of_a_frame(surveys, monkeypatch, stage):
-    """The share of real gather points whose rays are aimed, told from the survey, against a frame's kept rays."""
+    """The share of real gather points whose rays are aimed, told from the survey, against a frame's kept rays; and how
+    many they aim for each even one, against NumPy's count at the frame's points."""
+    from warp_dvct.bench.twins.aim import Aims
     from warp_dvct.passes import gather
 
-    shares = []
+    shares, toward = [], []
     run = gather.Gatherer.run
 
     def watching(self, launcher, points, index, count, nearness=None, kept=None, **kwargs):
@@ -140,6 +143,9 @@ def test_aimed_points_are_those_of_a_frame(surveys, monkeypatch, stage):
         if kept is not None:
             filled = kept.point.numpy() >= 0
             shares.append(float((kept.count.numpy()[filled] < self.rays).mean()))
+            place, normal = (a.numpy()[kept.point.numpy()[filled]] for a in (points.position, points.normal))
+            aims = Aims.of(self.scene.targets, place.astype(float), normal.astype(float), int(EVEN))
+            toward.append(float(aims.rays.sum(0)[aims.aimed].mean()) / int(EVEN))
         return result
 
     monkeypatch.setattr(gather.Gatherer, "run", watching)
@@ -148,6 +154,7 @@ def test_aimed_points_are_those_of_a_frame(surveys, monkeypatch, stage):
     relighter.render(np.full((relighter.height, 256, 3), 0.5, np.float32))
     assert [surveys[stage].on_real.aimed] == pytest.approx(shares, abs=0.03)
     assert 0.2 < shares[0] < 1.0
+    assert [surveys[stage].on_real.toward] == pytest.approx(toward, rel=0.05)
 
 
 def test_voxels_and_patches_are_those_of_a_frame(surveys):
@@ -239,11 +246,13 @@ def test_threads_by_amdahl(surveys):
 
 @pytest.mark.parametrize("stage", ["room_area", "room_glossy", "ground_dome"])
 def test_more_time_is_used_and_predicts_less_error(surveys, stage):
-    """The prediction lands within a tenth of the budget, and the error never rises with it."""
+    """The prediction lands within a tenth of the budget, but where more rays would not show; and the error never rises
+    with it."""
     last = math.inf
     for budget in (0.25, 0.5, 1.0, 2.0, 5.0, 20.0):
         choice = chosen(surveys, stage, seconds=budget)
-        assert 0.9 * budget <= choice.seconds <= budget
+        assert choice.seconds <= budget
+        assert choice.seconds >= 0.9 * budget or (choice.enough and budget > 5.0)
         assert choice.error <= last
         last = choice.error
         for ladder in LADDERS:

@@ -231,16 +231,18 @@ def gather_part(settings: Settings, survey: Survey, part: str, points: float) ->
     if part not in REAL_PARTS:
         return gathered(survey, survey.on_object, points, settings.gather_object_rays)
     first = part == REAL_PARTS[0]
-    entered, aimed = (real.entered, real.aimed) if first else (real.entered_again, real.aimed_again)
-    # A share of the points sends fewer rays, half at the objects.
+    entered, aimed, toward = real.entered, real.aimed, real.toward
+    if not first:
+        entered, aimed, toward = real.entered_again, real.aimed_again, real.toward_again
+    # A share of the points sends fewer rays, and a part of them at the objects.
     few = int(settings.gather_rays * settings.gather_aimed) if survey.plate else 0
     far = points * aimed if few > 0 else 0.0
     counts = gathered(survey, real, points - far, settings.gather_rays, entered=entered)
-    aimed_counts = gathered(survey, real, far, 2 * few, entered=0.5 + 0.5 * entered)
+    aimed_counts = gathered(survey, real, far, few * (1.0 + toward), entered=(entered + toward) / (1.0 + toward))
     return {unit: count + aimed_counts[unit] for unit, count in counts.items()}
 
 
-def gathered(survey: Survey, where: PointNeed, points: float, rays: int, *, entered: float | None = None) -> Counts:
+def gathered(survey: Survey, where: PointNeed, points: float, rays: float, *, entered: float | None = None) -> Counts:
     """Rays of points by what they cost: all descend the real tree, some the synthetic one, some read voxels.
 
     Args:

@@ -56,9 +56,10 @@ class Settings:
     gather: str = _knob("rays", "how diffuse indirect light is gathered", choices=("rays", "cones"))
     gather_rays: int = _knob(64, "rays per gather point on real surfaces", low=1, high=65536)
     gather_aimed: float = _knob(
-        0.375,
-        "on a plate: share of a real gather point's rays that go towards the objects where these take up little of its"
-        " view, with as many over the hemisphere instead of all; 0 for never",
+        0.25,
+        "on a plate: share of a real gather point's rays that are spread evenly where the objects take up little of its"
+        " view; to these come up to three times as many towards the objects, by how much of it they take up; 0 for"
+        " never",
         low=0.0,
         high=1.0,
     )
@@ -149,6 +150,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "shadows.probes": 4,
         "gather.rays": 16,
         "gather.detail": 0.0,
+        "gather.aimed": 0.375,
         "gather.object_rays": 16,
         "glossy.rays": 2,
         "glossy.smoothing": 0.5,

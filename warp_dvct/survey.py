@@ -54,6 +54,7 @@ class PointNeed:
             that are gathered again at half the stride.
         aimed, aimed_again: Shares of the points, and of those again, of which the objects take up so little of the view
             that rays are aimed at them.
+        toward, toward_again: Rays that these points aim for each even one.
     """
 
     need: GatherNeed
@@ -62,6 +63,8 @@ class PointNeed:
     entered_again: float
     aimed: float
     aimed_again: float
+    toward: float
+    toward_again: float
 
 
 @dataclass(frozen=True)
@@ -212,7 +215,7 @@ def _look(
     lobed = (role >= 0) & (lobe[:, 0] > 0.0) & (lobe[:, 1] <= plan.alpha_max)
     sharp = lobed & (lobe[:, 1] < float(BLURRED))
     kinds = {"object": role == int(Role.SYNTHETIC), "sharp": sharp, "blurred": lobed & ~sharp}
-    met, entered, nearness, aimed = _around(scene, device_scene, launcher, plan, buffer)
+    met, entered, nearness, toward = _around(scene, device_scene, launcher, plan, buffer)
     arrays = (points.pixel, points.position, points.normal, points.normal_g, points.footprint)
     shown = Seen(role, *(a.numpy() for a in arrays))
     changed = changed.repeat(2, 0).repeat(2, 1)
@@ -225,7 +228,8 @@ def _look(
         needs[name] = PointNeed(
             need,
             *(_mean(met, mask), _mean(entered, mask), _mean(entered, again)),
-            *(_mean(aimed, mask), _mean(aimed, again)),
+            *(_mean(toward > 0.0, where) for where in (mask, again)),
+            *(_mean(toward, where & (toward > 0.0)) for where in (mask, again)),
         )
     edges = EdgeNeed()
     if buffer.count > pixels:
@@ -250,20 +254,20 @@ def _around(
     scene: Scene, device_scene: DeviceScene, launcher: Launcher, plan: Plan, buffer: GBuffer
 ) -> tuple[np.ndarray, ...]:
     """By pixel, from every other one each way: shares of its rays that meet a surface and that pass the synthetic box
-    (NaN where there is no surface), the mean inverse distance of what they meet, and whether any are aimed (1 or 0)."""
+    (NaN where there is no surface), the mean inverse distance of what they meet, and rays aimed for each even one."""
     shape = -(-buffer.height // 2), -(-buffer.width // 2)
     rows, columns = np.meshgrid(*(2 * np.arange(n) for n in shape), indexing="ij")
     index = launcher.array((rows * buffer.width + columns).ravel().astype(np.int32), wp.int32)
     count = index.shape[0]
     bounds = scene.bounds(Role.SYNTHETIC)
     low, high = ((b - np.asarray(plan.origin)) * plan.scale for b in bounds) if bounds else (np.ones(3), np.zeros(3))
-    met, entered, aimed = (launcher.empty(count, wp.int32) for _ in range(3))
-    nearness = launcher.empty(count, wp.float32)
+    met, entered = (launcher.empty(count, wp.int32) for _ in range(2))
+    nearness, toward = (launcher.empty(count, wp.float32) for _ in range(2))
     inputs = [buffer.points, index, device_scene.geometry, device_scene.targets, wp.vec3(*low), wp.vec3(*high), RAYS, 0]
-    launcher.launch(kernels._look_around, count, inputs, [met, entered, nearness, aimed])
+    launcher.launch(kernels._look_around, count, inputs, [met, entered, nearness, toward])
     found = met.numpy().astype(np.float64)
     missing = found < 0
-    shares = (found / RAYS, entered.numpy() / RAYS, nearness.numpy().astype(np.float64), aimed.numpy().astype(float))
+    shares = (found / RAYS, entered.numpy() / RAYS, *(a.numpy().astype(np.float64) for a in (nearness, toward)))
     full = [np.where(missing, np.nan if k < 2 else 0.0, a).reshape(shape) for k, a in enumerate(shares)]
     return tuple(a.repeat(2, 0).repeat(2, 1)[: buffer.height, : buffer.width] for a in full)
 

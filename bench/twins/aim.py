@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 
 from warp_dvct.bench.twins.numbers import dot, from_frame
-from warp_dvct.bench.twins.stage import Twin
-from warp_dvct.kernels.aim import NARROWEST, ROUND, WIDEST
+from warp_dvct.kernels.aim import FEWEST, MOST, NARROWEST, PER_SHARE, ROUND, WIDEST
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,14 @@ class Aims:
     rays: np.ndarray  # [targets, n]
 
     @staticmethod
-    def of(twin: Twin, position: np.ndarray, normal: np.ndarray, rays: int) -> Aims:
-        """``rays`` of a point, spread evenly over the sectors of the scene's targets."""
-        targets = twin.device.targets
+    def of(targets: Any, position: np.ndarray, normal: np.ndarray, even: int) -> Aims:
+        """Rays of points that send ``even`` others, spread over the sectors of ``Targets``."""
         boxes = [(targets.center, targets.extent), (targets.other_center, targets.other_extent)][: targets.count]
         sectors = tuple(Sectors.of(np.array([*c], float), np.array([*e], float), position, normal) for c, e in boxes)
         shares = np.array([sector.share for sector in sectors])
         whole = shares.sum(0)
-        aimed = (whole > 0.0) & (whole < float(WIDEST)) & (rays > 0)
+        aimed = (whole > 0.0) & (whole < float(WIDEST)) & (even > 0)
+        rays = np.maximum(np.floor(even * np.clip(float(PER_SHARE) * whole, float(FEWEST), float(MOST)) + 0.5), 1.0)
         first = np.floor(rays * shares[0] / np.where(whole > 0.0, whole, 1.0) + 0.5)
         return Aims(aimed, sectors, np.stack([first, rays - first])[: len(sectors)])
 

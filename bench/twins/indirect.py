@@ -23,6 +23,7 @@ from warp_dvct.bench.twins.numbers import (
 from warp_dvct.bench.twins.stage import Twin
 from warp_dvct.bench.twins.volumes import N, fields, lit
 from warp_dvct.kernels import bounces, cones, gather, gather_cones, reconstruction, specular
+from warp_dvct.kernels.aim import MOST
 from warp_dvct.kernels.bounce_field import Patch
 from warp_dvct.kernels.environment import Environment
 from warp_dvct.kernels.gbuffer import Points
@@ -207,14 +208,16 @@ def _gathered(launcher: Any, aimed: float, what: str, *, halves: bool = False) -
 
     field = fields(voxels)[0]
     few = round(RAYS * aimed)
-    aims = Aims.of(twin, position, normal, few)
+    aims = Aims.of(twin.device.targets, position, normal, few)
     total = np.zeros((COUNT, 2, 3))
     for k in range(RAYS):
         disk = np.broadcast_to(concentric_disk(sobol2(0, 0, k, 11)), (COUNT, 2))
         total += weighted(twin, (position, normal, triangle), disk, ~aims.aimed / RAYS, field)
-    for k in range(few):
-        for disk in (concentric_disk(sobol2(0, 0, k, 11)) + np.zeros((COUNT, 1)), aims.draw(k, sobol2(0, 0, k, 12))):
-            total += weighted(twin, (position, normal, triangle), disk, aims.aimed / (few + aims.density(disk)), field)
+    for k in range(int(few * float(MOST))):
+        even = concentric_disk(sobol2(0, 0, k, 11)) + np.zeros((COUNT, 1))
+        for disk, count in ((even, few), (aims.draw(k, sobol2(0, 0, k, 12)), aims.rays.sum(0))):
+            weight = (aims.aimed & (k < count)) / (few + aims.density(disk))
+            total += weighted(twin, (position, normal, triangle), disk, weight, field)
     kernel = gather._gather_rays
     return [compare(kernel, name + what, got[s].numpy(), total[:, s]) for s, name in enumerate(("before", "after"))]
 
