@@ -71,8 +71,8 @@ def test_counts_follow_their_settings(surveys):
         names = {k.replace("__", "."): v for k, v in changes.items()}
         return count_work(make_settings("balanced", {"gather.aimed": 0, **names}), room, 320, 180)
 
-    base = counted(gather__rays=64, gather__object_rays=64, rsm__texels=64, volume__coarse=0, bounces=5)
-    twice = counted(gather__rays=128, gather__object_rays=128, rsm__texels=64)["gather"]
+    base = counted(gather__detail=0, rsm__texels=64, volume__coarse=0, bounces=5)
+    twice = counted(gather__detail=0, gather__rays=128, gather__object_rays=128, rsm__texels=64)["gather"]
     more = FIRST_RAYS * math.sqrt(64), FIRST_RAYS * math.sqrt(128)
     assert twice["rays"] == pytest.approx(base["gather"]["rays"] * (128 + more[1]) / (64 + more[0]))
     assert twice["gathered"] == pytest.approx(base["gather"]["gathered"])
@@ -102,7 +102,8 @@ def counted_gathers(monkeypatch) -> list[float]:
     run = gather.Gatherer.run
 
     def counting(self, launcher, points, index, count, *args, **kwargs):
-        found.append(int((index.numpy()[:count] >= 0).sum()) * (self.rays + FIRST_RAYS * math.sqrt(self.rays)))
+        rays = gather.rays_of(kwargs.get("part", ""), self.rays)
+        found.append(int((index.numpy()[:count] >= 0).sum()) * (rays + FIRST_RAYS * math.sqrt(rays)))
         return run(self, launcher, points, index, count, *args, **kwargs)
 
     monkeypatch.setattr(gather.Gatherer, "run", counting)

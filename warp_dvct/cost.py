@@ -13,7 +13,7 @@ from functools import lru_cache
 from warp_dvct.cost_cones import by_cones, gathered_by_cones, glossy_cones, shadow_cones
 from warp_dvct.cost_model import Counts
 from warp_dvct.gather_need import GatherNeed
-from warp_dvct.passes.gather import GATHER_PARTS, HIDDEN, HIDDEN_FEWER, OBJECT_PARTS, REAL_PARTS
+from warp_dvct.passes.gather import GATHER_PARTS, HIDDEN, OBJECT_PARTS, REAL_PARTS, rays_of
 from warp_dvct.pilot import VolumeNeed
 from warp_dvct.settings import Settings
 from warp_dvct.survey import MapNeed, PointNeed, Survey
@@ -225,19 +225,19 @@ def gather_points(settings: Settings, survey: Survey, width: int, height: int) -
 
 def gather_part(settings: Settings, survey: Survey, part: str, points: float) -> Counts:
     """Rays of ``points`` of one of ``GATHER_PARTS``, by what they cost."""
-    real = survey.on_real
+    real, rays = survey.on_real, rays_of(part, settings.gather_rays)
     if part == HIDDEN:
-        return gathered(survey, real, points, max(1, settings.gather_rays // HIDDEN_FEWER), entered=real.entered_again)
+        return gathered(survey, real, points, rays, entered=real.entered_again)
     if part not in REAL_PARTS:
-        return gathered(survey, survey.on_object, points, settings.gather_object_rays)
+        return gathered(survey, survey.on_object, points, rays_of(part, settings.gather_object_rays))
     first = part == REAL_PARTS[0]
     entered, aimed, toward = real.entered, real.aimed, real.toward
     if not first:
         entered, aimed, toward = real.entered_again, real.aimed_again, real.toward_again
     # A share of the points sends fewer rays, and a part of them at the objects.
-    few = int(settings.gather_rays * settings.gather_aimed) if survey.plate else 0
+    few = int(rays * settings.gather_aimed) if survey.plate else 0
     far = points * aimed if few > 0 else 0.0
-    counts = gathered(survey, real, points - far, settings.gather_rays, entered=entered)
+    counts = gathered(survey, real, points - far, rays, entered=entered)
     aimed_counts = gathered(survey, real, far, few * (1.0 + toward), entered=(entered + toward) / (1.0 + toward))
     return {unit: count + aimed_counts[unit] for unit, count in counts.items()}
 

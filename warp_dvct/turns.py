@@ -17,7 +17,7 @@ import warp as wp
 from warp_dvct.cost import gather_part, gather_points
 from warp_dvct.cost_model import Counts, price
 from warp_dvct.launch import Launcher
-from warp_dvct.passes.gather import GATHER_PARTS, HIDDEN, HIDDEN_FEWER, OBJECT_PARTS, REAL_PARTS, Turn
+from warp_dvct.passes.gather import GATHER_PARTS, HIDDEN, OBJECT_PARTS, REAL_PARTS, Turn
 from warp_dvct.settings import NAMES, Settings
 from warp_dvct.survey import Survey
 
@@ -93,7 +93,7 @@ class GatherTurns:
         for number in range(of):
             rays = self.rays(part, points * (of - number) / of) if number else rays
             start, compiled = time.perf_counter(), launcher.compile_seconds
-            yield Turn(number, of, max(1, rays // HIDDEN_FEWER) if part == HIDDEN else rays)
+            yield Turn(number, of, rays)
             wp.synchronize_device(launcher.device)
             spent = time.perf_counter() - start - (launcher.compile_seconds - compiled)
             self._learn(self._seconds(with_rays(self.settings, rays), part, points / of), spent)

@@ -25,7 +25,7 @@ from warp_dvct.layers import Radiance
 from warp_dvct.passes.bounces import mean_albedo, reinject, solve_bounces
 from warp_dvct.passes.environment import build_environment
 from warp_dvct.passes.gather import (
-    HIDDEN_FEWER,
+    HIDDEN,
     Gatherer,
     Turns,
     focusing_materials,
@@ -376,8 +376,8 @@ def _irradiance(
     aimed = 0.0 if part.with_before else settings.gather_aimed
     real = Gatherer(scene, world, settings.gather_rays, *shared, aimed, turns)
     if part.points is not buffer.points:
-        fewer = Gatherer(scene, world, max(1, settings.gather_rays // HIDDEN_FEWER), *shared, turns=turns)
-        return gather_all(launcher, part.points, part.count, fewer)
+        even = Gatherer(scene, world, settings.gather_rays, *shared, turns=turns)
+        return gather_all(launcher, part.points, part.count, even, part=HIDDEN)
     synthetic = Gatherer(scene, world, settings.gather_object_rays, *shared, turns=turns)
     irradiance = launcher.empty(part.count, wp.vec3), launcher.empty(part.count, wp.vec3)
     how = {

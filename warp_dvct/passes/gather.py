@@ -27,13 +27,20 @@ REAL_PARTS = tuple(f"real {kind}" for kind in KINDS)
 OBJECT_PARTS = tuple(f"object {kind}" for kind in KINDS)
 HIDDEN = "hidden"
 GATHER_PARTS = (*OBJECT_PARTS, *REAL_PARTS, HIDDEN)
-HIDDEN_FEWER = 4  # times fewer rays of a hidden point
+# By part, how many times fewer rays its points have: halved strides come in numbers, and noise that fine shows less
+# (docs/accuracy.md).
+FEWER = {OBJECT_PARTS[1]: 2, REAL_PARTS[1]: 2, HIDDEN: 4}
+
+
+def rays_of(part: str, rays: int) -> int:
+    """Of a point of a part, where others have ``rays``."""
+    return max(1, rays // FEWER.get(part, 1))
 
 
 @dataclass(frozen=True)
 class Turn:
     """A share of the points of a part, runs of neighbours that lie evenly over all of them: the ``number``-th of ``of``
-    such shares. ``rays``: Of a point."""
+    such shares. ``rays``: Of a point, which :func:`rays_of` may lessen."""
 
     number: int
     of: int
@@ -81,12 +88,13 @@ class Gatherer:
         kept: Any = None,
         *,
         stride: int = 1,
-        part: str = HIDDEN,
+        part: str = "",
     ) -> tuple[Any, Any]:
         """Irradiance [W m^-2] before and after at points ``index`` (-1 gives 0): two vec3 ``[count]``.
 
         ``nearness``, float ``[count]``, receives the mean inverse distance of what rays met (cones leave it alone).
-        ``stride``: Spacing of the points in pixels. ``kept``: ``KeptRays`` of ``count`` slots (:func:`keep_rays`), for
+        ``stride``: Spacing of the points in pixels. ``part``: One of ``GATHER_PARTS``, for turns and :func:`rays_of`.
+        ``kept``: ``KeptRays`` of ``count`` slots (:func:`keep_rays`), for
         pixels' centres on real surfaces.
         """
         if nearness is None:
@@ -110,7 +118,7 @@ class Gatherer:
             how = [
                 self.scene.targets,
                 wp.vec4i(turn.number, turn.of, count, parts),
-                turn.rays,
+                rays_of(part, turn.rays),
                 self.aimed,
                 self.edge_samples,
                 stride,
@@ -312,11 +320,11 @@ def _refine(
     return _smooth(launcher, buffer, _Grid(stride, columns, rows, gathered, nearness, before, after), mark, smoothing)
 
 
-def gather_all(launcher: Launcher, points: Any, count: int, gatherer: Gatherer) -> tuple[Any, Any]:
-    """Irradiance, before and after, gathered at each of ``count`` points."""
+def gather_all(launcher: Launcher, points: Any, count: int, gatherer: Gatherer, *, part: str = "") -> tuple[Any, Any]:
+    """Irradiance, before and after, gathered at each of ``count`` points (``part``: as in :meth:`Gatherer.run`)."""
     everyone = launcher.full(max(1, count), 1, wp.int32)
     _, index, _ = compact(launcher, everyone)
-    return gatherer.run(launcher, points, index, count)
+    return gatherer.run(launcher, points, index, count, part=part)
 
 
 def shade_indirect(
