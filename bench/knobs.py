@@ -52,7 +52,7 @@ KNOBS = (
         ("12/6", "8/4", "6/3", "4/2", "2/1", "1/1"),
         ("gather.stride", "gather.object_stride"),
     ),
-    Knob("delta-cones", "shadows.samples", ("1", "4", "16", "64"), ("shadows.samples", "shadows.probes")),
+    Knob("delta-cones", "shadows.samples", ("1", "4", "8", "16", "64"), ("shadows.samples", "shadows.probes")),
     Knob("delta-cones", "shadows", ("cone", "ray")),
     Knob("delta-cones", "gather", ("cones", "rays")),
     Knob("delta-cones", "cones.count", ("4", "6", "9", "16", "36"), given=CONES),

@@ -40,7 +40,7 @@ TABLES = {
     "shadows": [
         "`shadows=cone`: shadows=cone",
         "4 samples, all traced: shadows.samples=4 shadows.probes=4",
-        "16, all traced: shadows.probes=16",
+        "16, all traced: shadows.samples=16 shadows.probes=16",
         "64, all traced: shadows.samples=64 shadows.probes=64",
     ],
     "volume and maps": [

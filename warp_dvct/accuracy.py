@@ -32,7 +32,7 @@ REFERENCE = {
     "gather.stride": 8,
     "gather.object_stride": 4,
     "gather.detail": 0.15,
-    "shadows.samples": 16,
+    "shadows.samples": 8,
     "shadows.probes": 8,
     "bounces": 8,
     "patches.count": 8192,
@@ -67,7 +67,7 @@ class Ladder:
         if self.knob == STRIDE:
             return {STRIDE: value, "gather.object_stride": OBJECT_STRIDE[int(value)]}
         if self.knob == "shadows.samples":
-            return {"shadows.samples": value, "shadows.probes": value if value < 8 else value // 2}
+            return {"shadows.samples": value, "shadows.probes": value if value <= 8 else value // 2}
         if self.knob == VPLS:
             return {VPLS: value, "vpls.sky": value}
         return {self.knob: value}

@@ -47,7 +47,7 @@ class Settings:
     rsm_density: float = _knob(2.0, "texels per voxel edge at the volume's far side", low=0.01, high=16.0)
 
     shadows: str = _knob("ray", "how direct shadows are found", choices=("ray", "cone"))
-    shadows_samples: int = _knob(16, "samples per light and shading point", low=1, high=4096)
+    shadows_samples: int = _knob(8, "samples per light and shading point", low=1, high=4096)
 
     shadows_probes: int = _knob(
         8, "samples traced first; the others are traced only where these disagree", low=1, high=4096
