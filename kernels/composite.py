@@ -6,6 +6,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 HALF_MAX = wp.constant(65504.0)
 FLOAT_LARGE = wp.constant(1.0e38)
+PLAIN = wp.constant(32768.0)  # sums of a pixel's numbers up to this are far from what half precision cannot hold
 # Below the smallest normal half number a ratio to the plate is rounding noise: there the shadow is left at 1.
 HALF_TINY = wp.constant(6.103515625e-05)
 
@@ -51,14 +52,6 @@ def count_nan(value: float) -> int:
     return wp.where(wp.isnan(value), 1, 0)
 
 
-@wp.func
-def shadow_ratio(plate: float, delta: float) -> float:
-    """With / without the synthetic objects, in [0, 1]; 1 where nothing darkens or the plate is black."""
-    if delta >= 0.0 or plate < HALF_TINY:
-        return 1.0
-    return wp.clamp((plate + delta) / plate, 0.0, 1.0)
-
-
 @wp.kernel
 def _composite_pixels(
     first: int,
@@ -89,20 +82,37 @@ def _composite_pixels(
     added = wp.vec3()
     delta = wp.vec3()
     for c in range(3):
-        invalid += count_nan(raw_plate[c]) + count_nan(raw_delta[c]) + count_nan(raw_synthetic[c])
         mean = float(0.0)
         if coverage < 1.0:
-            # From the sum over the pixel's real part to the mean over that part.
-            mean = raw_delta[c] / (1.0 - covered)
-        change = storable(mean)
-        # The ratio is taken before rounding, so that a full shadow is exactly black, and before clamping, so that a
-        # slight shadow on something too bright to store is not.
-        ratio = round_half(shadow_ratio(finite(raw_plate[c]), finite(mean)))
-        base = round_half(storable(raw_plate[c]))
-        light = round_half(wp.max(change, 0.0))
-        own = round_half(storable(raw_synthetic[c]))
+            mean = raw_delta[c]
+            if covered > 0.0:
+                # From the sum over the pixel's real part to the mean over that part.
+                mean = mean / (1.0 - covered)
+        photo = raw_plate[c]
+        object = raw_synthetic[c]
+        change = mean
+        outside = int(0)
+        # False for NaN as well: nearly all pixels are spared the rest.
+        plain = wp.abs(photo) + wp.abs(raw_delta[c]) + wp.abs(mean) + wp.abs(object) <= PLAIN
+        if not plain:
+            invalid += count_nan(photo) + count_nan(raw_delta[c]) + count_nan(object)
+            outside = count_outside(photo) + count_outside(object) + count_outside(mean)
+            photo = finite(photo)
+            mean = finite(mean)
+            object = storable(object)
+            change = storable(mean)
+        ratio = float(1.0)
+        if mean < 0.0 and photo >= HALF_TINY:
+            # Before rounding, so that a full shadow is exactly black, and before clamping, so that a slight shadow on
+            # something too bright to store is not.
+            ratio = round_half(wp.clamp((photo + mean) / photo, 0.0, 1.0))
+        if not plain:
+            photo = storable(photo)
+        base = round_half(photo)
+        own = round_half(object)
+        changed = round_half(change)
+        light = wp.max(changed, 0.0)
         total = own + (1.0 - coverage) * (base * ratio + light)
-        outside = count_outside(raw_plate[c]) + count_outside(raw_synthetic[c]) + count_outside(mean)
         # One value counts once, however many of its layers were clamped.
         clamped += wp.min(outside + count_outside(total), 1)
         result = round_half(wp.clamp(total, -HALF_MAX, HALF_MAX))
@@ -113,7 +123,7 @@ def _composite_pixels(
         plate[c] = base
         shadow[c] = ratio
         added[c] = light
-        delta[c] = round_half(change)
+        delta[c] = changed
     rgba_out[i] = rgba
     comp_out[i] = comp
     plate_out[i] = plate
