@@ -14,6 +14,7 @@ class Gathered:
 
     choice: wp.array(dtype=wp.int32)  # [columns * rows], the point, or -1
     center: wp.array(dtype=wp.vec2)  # of its pixel, in pixels
+    triangle: wp.array(dtype=wp.int32)
     position: wp.array(dtype=wp.vec3)
     normal_g: wp.array(dtype=wp.vec3)
     normal: wp.array(dtype=wp.vec3)
@@ -54,6 +55,7 @@ def _choose_points(
     gathered_out.choice[i] = found
     if found >= 0:
         gathered_out.center[i] = wp.vec2(float(found % width) + 0.5, float(found / width) + 0.5)
+        gathered_out.triangle[i] = points.triangle[found]
         gathered_out.position[i] = points.position[found]
         gathered_out.normal_g[i] = points.normal_g[found]
         gathered_out.normal[i] = points.normal[found]
@@ -81,17 +83,25 @@ def falloff(square: float) -> float:
 
 @wp.func
 def same_surface(
-    position: wp.vec3, normal_g: wp.vec3, normal: wp.vec3, tolerance: float, gathered: Gathered, block: int
+    triangle: int,
+    position: wp.vec3,
+    normal_g: wp.vec3,
+    normal: wp.vec3,
+    tolerance: float,
+    gathered: Gathered,
+    block: int,
 ) -> float:
     """Weight in [0, 1] by how well two points lie in each other's tangent plane and face the same way; ``tolerance`` is
-    the distance off the plane at which they hardly count."""
+    the distance off the plane at which they hardly count. Points of one triangle lie in its plane."""
     facing = wp.dot(normal, gathered.normal[block])
     if facing <= 0.0:
         return 0.0
-    offset = gathered.position[block] - position
-    gap = wp.max(wp.abs(wp.dot(offset, normal_g)), wp.abs(wp.dot(offset, gathered.normal_g[block]))) / tolerance
     square = facing * facing
     fourth = square * square
+    if gathered.triangle[block] == triangle:
+        return fourth * fourth
+    offset = gathered.position[block] - position
+    gap = wp.max(wp.abs(wp.dot(offset, normal_g)), wp.abs(wp.dot(offset, gathered.normal_g[block]))) / tolerance
     return fourth * fourth * falloff(gap * gap)
 
 
@@ -123,6 +133,7 @@ def _smooth(
         position = gathered.position[i]
         normal = gathered.normal[i]
         normal_g = gathered.normal_g[i]
+        triangle = gathered.triangle[i]
         tolerance = guide.plane * float(guide.stride) * points.footprint[at]
         for dy in range(-guide.radius, guide.radius + 1):
             for dx in range(-guide.radius, guide.radius + 1):
@@ -135,7 +146,7 @@ def _smooth(
                         inverse = wp.max(nearness_in[i], nearness_in[block]) / guide.reach
                         apart = wp.length_sq(gathered.position[block] - position) * inverse * inverse
                         weight = falloff(apart)
-                        weight *= same_surface(position, normal_g, normal, tolerance, gathered, block)
+                        weight *= same_surface(triangle, position, normal_g, normal, tolerance, gathered, block)
                         if weight > 1.0e-3:
                             total += weight
                             before += before_in[block] * weight
@@ -167,6 +178,7 @@ def interpolated(
     position = points.position[i]
     normal = points.normal[i]
     normal_g = points.normal_g[i]
+    triangle = points.triangle[i]
     tolerance = guide.plane * float(guide.stride) * points.footprint[i]
     cx = points.pixel[i][0] / guide.stride
     cy = points.pixel[i][1] / guide.stride
@@ -183,7 +195,8 @@ def interpolated(
                 dy = gathered.center[block][1] - py
                 near = wp.max(0.0, 1.0 - (dx * dx + dy * dy) * scale)
                 if near > 0.0:
-                    weight = near * near * same_surface(position, normal_g, normal, tolerance, gathered, block)
+                    same = same_surface(triangle, position, normal_g, normal, tolerance, gathered, block)
+                    weight = near * near * same
                     if weight > 1.0e-4:
                         total += weight
                         before += before_in[block] * weight

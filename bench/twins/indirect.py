@@ -309,7 +309,7 @@ def falloff(square: np.ndarray) -> np.ndarray:
 
 
 def measure_reconstruction(launcher: Any) -> list[Deviation]:
-    """One a-trous step over the marked ones of gathered points of a bumpy grid."""
+    """One a-trous step over the marked ones of gathered points of a bumpy grid, two to a triangle."""
     rng = np.random.default_rng(9)
     columns, rows = 9, 7
     count = columns * rows
@@ -328,6 +328,8 @@ def measure_reconstruction(launcher: Any) -> list[Deviation]:
     gathered = reconstruction.Gathered()
     gathered.choice = launcher.array(np.arange(count, dtype=np.int32), wp.int32)
     gathered.center = launcher.zeros(count, wp.vec2)
+    triangle = np.arange(count) // 2
+    gathered.triangle = launcher.array(triangle.astype(np.int32), wp.int32)
     gathered.position, gathered.normal, gathered.normal_g = points.position, points.normal, points.normal_g
     light, nearness = rng.uniform(0, 3, (count, 3)), rng.uniform(0.3, 2.0, count)
     given = [launcher.array(light.astype(np.float32), wp.vec3)] * 2
@@ -341,6 +343,7 @@ def measure_reconstruction(launcher: Any) -> list[Deviation]:
     offset = place[None] - place[:, None]
     facing = np.maximum(normal @ normal.T, 0.0)
     gap = np.maximum(np.abs(np.einsum("ijx,ix->ij", offset, normal)), np.abs(np.einsum("ijx,jx->ij", offset, normal)))
+    gap[triangle[:, None] == triangle] = 0.0
     apart = np.linalg.norm(offset, axis=-1) * np.maximum(nearness[:, None], nearness[None]) / 0.25
     weight = facing**8 * falloff((gap / (0.5 * 6 * 0.01)) ** 2) * falloff(apart**2) * close
     weight = np.where((weight > 1e-3) & mark[:, None], weight, 0.0)

@@ -256,6 +256,7 @@ def _choose(launcher: Launcher, buffer: GBuffer, stride: int, columns: int, rows
     gathered = reconstruction.Gathered()
     gathered.choice = launcher.empty(columns * rows, wp.int32)
     gathered.center = launcher.empty(columns * rows, wp.vec2)
+    gathered.triangle = launcher.empty(columns * rows, wp.int32)
     gathered.position, gathered.normal_g, gathered.normal = (launcher.empty(columns * rows, wp.vec3) for _ in range(3))
     window = buffer.window if role == Role.SYNTHETIC else (0, buffer.width - 1, 0, buffer.height - 1)
     launcher.launch(
