@@ -69,7 +69,7 @@ def fit_table(rows: Sequence[Mapping[str, Any]]) -> Fit:
 
     Args:
         rows: Of ``bench tradeoff``, of several stages; path tracing, which has no table, is left aside. A stage without
-            noise says what outlines cost, the others all else.
+            noise says what outlines cost, the others all else; by cones it errs by more than its outlines.
     Raises:
         OptionError: No stage has the base point, or no knob was swept.
     """
@@ -81,7 +81,7 @@ def fit_table(rows: Sequence[Mapping[str, Any]]) -> Fit:
         surveys[stage] = survey(scene, make_settings(), launcher, scene.camera.aspect, has_plate=True)
     still = {stage for stage, found in surveys.items() if found.noise <= LEAST_NOISE}
     sweeps = {method: _Sweep.of(method, [r for r in rows if r["stage"] not in still]) for method in LADDERS_OF}
-    outlines = _Sweep.of("delta-cones", [r for r in rows if r["stage"] in still])
+    outlines = _Sweep.of("delta-cones", [r for r in rows if r["stage"] in still and not _by_cones(r)])
     cones = sweeps["delta-cones"]
     if not cones.base:
         raise OptionError("no stage has the reference point; docs/tradeoff.md says how to measure it")
@@ -117,6 +117,11 @@ def fit_table(rows: Sequence[Mapping[str, Any]]) -> Fit:
 def net_flip(row: Mapping[str, Any]) -> float:
     """FLIP of the picture without what the truth's own noise is worth: independent errors add as squares."""
     return math.sqrt(max(row["errors"]["FLIP"]["picture"] ** 2 - row["truth"]["noise"] ** 2, 0.0))
+
+
+def _by_cones(row: Mapping[str, Any]) -> bool:
+    """Whether any light is found by cones."""
+    return any(row["resolved"][NAMES[knob]] == form for knob, form in FORMS.items())
 
 
 def _settings(row: Mapping[str, Any]) -> Settings:

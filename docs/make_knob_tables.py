@@ -30,7 +30,7 @@ TABLES = {
         "`gather.rays=256`, objects too: gather.rays=256 gather.object_rays=256",
         "`gather.aimed=0`: gather.aimed=0",
         "`gather.aimed=0`, 32 rays: gather.aimed=0 gather.rays=32",
-        "`gather.aimed=0.25`: gather.aimed=0.25",
+        "`gather.aimed=0.125`: gather.aimed=0.125",
         "`gather.aimed=1`: gather.aimed=1",
         "`gather.detail=0`: gather.detail=0",
         "strides of 2 and 1: gather.stride=2 gather.object_stride=1",

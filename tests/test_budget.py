@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 from known_costs import chosen, made_model
 
 from warp_dvct import Relighter
@@ -100,17 +101,17 @@ def test_counts_follow_their_settings(surveys):
 @pytest.fixture
 def counted_gathers(monkeypatch) -> list[float]:
     """How many rays each gather traces, a point's first ones counted as what they cost; rendering fills it."""
-    from warp_dvct.passes import gather
-
     found: list[float] = []
-    run = gather.Gatherer.run
+    launch = Launcher.launch
 
-    def counting(self, launcher, points, index, count, *args, **kwargs):
-        rays = gather.rays_of(kwargs.get("part", ""), self.rays)
-        found.append(int((index.numpy()[:count] >= 0).sum()) * (rays + FIRST_RAYS * math.sqrt(rays)))
-        return run(self, launcher, points, index, count, *args, **kwargs)
+    def counting(self, kernel, count, inputs, outputs=()):
+        if kernel.key.startswith("_gather_rays"):
+            index = next(value for value in inputs if isinstance(value, wp.array))
+            rays = next(value for value in inputs if isinstance(value, int))
+            found.append(int((index.numpy() >= 0).sum()) * (rays + FIRST_RAYS * math.sqrt(rays)))
+        return launch(self, kernel, count, inputs, outputs)
 
-    monkeypatch.setattr(gather.Gatherer, "run", counting)
+    monkeypatch.setattr(Launcher, "launch", counting)
     return found
 
 
