@@ -69,7 +69,7 @@ def fit_table(rows: Sequence[Mapping[str, Any]]) -> Fit:
 
     Args:
         rows: Of ``bench tradeoff``, of several stages; path tracing, which has no table, is left aside. A stage without
-            noise says what outlines cost, the others all else; by cones it errs by more than its outlines.
+            noise says what outlines cost, the others all else; its rows by cones, which leak there, are left aside.
     Raises:
         OptionError: No stage has the base point, or no knob was swept.
     """

@@ -94,8 +94,7 @@ class Gatherer:
 
         ``nearness``, float ``[count]``, receives the mean inverse distance of what rays met (cones leave it alone).
         ``stride``: Spacing of the points in pixels. ``part``: One of ``GATHER_PARTS``, for turns and :func:`rays_of`.
-        ``kept``: ``KeptRays`` of ``count`` slots (:func:`keep_rays`), for
-        pixels' centres on real surfaces.
+        ``kept``: ``KeptRays`` of ``count`` slots (:func:`keep_rays`), for pixels' centres on real surfaces.
         """
         if nearness is None:
             nearness = launcher.empty(max(1, count), wp.float32)
