@@ -10,6 +10,7 @@ work: each writes its own sum, or a maximum that is atomic there and does not de
 from __future__ import annotations
 
 import copy
+import math
 import os
 import time
 import weakref
@@ -24,6 +25,7 @@ import warp as wp
 
 from warp_dvct.check import Checker, poison
 from warp_dvct.errors import DeviceError, OptionError
+from warp_dvct.host_pool import SMALLEST, HostPool
 
 SLABS_PER_THREAD = 8  # enough that an uneven slab does not leave the other threads idle
 MIN_SLAB_SECONDS = 1.0e-4  # less work is not worth handing to another thread
@@ -33,6 +35,7 @@ THREADS_CUDA = 2**20  # beyond which more parts would fill memory and not the GP
 KEPT_BYTES_CUDA = 2**30  # freed memory that is kept for the next arrays: to return it and ask again takes 0.1 ms each
 FORGETTING = 0.7  # of the dearest launch so far, per launch: kernels are launched with light and heavy elements in turn
 
+_host_pool = HostPool()  # of all launchers: frames from scratch follow one another too
 # Seconds an element took in each kernel's launches so far, by kernel and device: they decide the slabs, never a result.
 _element_seconds: dict[tuple[Any, str], float] = {}
 
@@ -63,7 +66,7 @@ class Launcher:
         self.compile_cpu_seconds = 0.0
         self.live_bytes = 0
         self.peak_bytes = 0
-        self._counts: dict[int, weakref.finalize[..., Any]] = {}  # of arrays in use, by their id
+        self._counts: dict[int, weakref.ref[wp.array]] = {}  # of arrays in use, by their id
         self._scopes: list[list[Any]] = []
         self._loaded: set[tuple[int, str]] = set()
         self.checker = Checker() if check else None
@@ -190,48 +193,71 @@ class Launcher:
 
     def empty(self, shape: int | tuple[int, ...], dtype: Any) -> wp.array:
         """An uninitialised device array, counted in ``peak_bytes``."""
-        array = self._counted(lambda: wp.empty(shape, dtype=dtype, device=self.device), shape, dtype)
+        array = self._counted(lambda: self._new(shape, dtype), shape, dtype)
         return array if self.checker is None else poison(array)
 
     def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> wp.array:
         """A zeroed device array, counted in ``peak_bytes``."""
-        return self._counted(lambda: wp.zeros(shape, dtype=dtype, device=self.device), shape, dtype)
+        array = self._counted(lambda: self._new(shape, dtype), shape, dtype)
+        array.zero_()
+        return array
 
     def full(self, shape: int | tuple[int, ...], value: Any, dtype: Any) -> wp.array:
         """A device array filled with ``value``, counted in ``peak_bytes``."""
-        return self._counted(lambda: wp.full(shape, value, dtype=dtype, device=self.device), shape, dtype)
+        array = self._counted(lambda: self._new(shape, dtype), shape, dtype)
+        array.fill_(value)
+        return array
 
     def array(self, values: np.ndarray, dtype: Any) -> wp.array:
         """Copy host values to the device, counted in ``peak_bytes``; the copy never aliases ``values``."""
         values = np.ascontiguousarray(values)
-        return self._counted(lambda: wp.array(values, dtype=dtype, device=self.device, copy=True), values.shape, dtype)
+        if self.device.is_cuda or values.nbytes < SMALLEST:
+            make = lambda: wp.array(values, dtype=dtype, device=self.device, copy=True)  # noqa: E731
+            return self._counted(make, values.shape, dtype)
+        given = wp.array(values, dtype=dtype, device=self.device, copy=False)
+        array = self._counted(lambda: self._new(given.shape, dtype), given.shape, dtype)
+        wp.copy(array, given)
+        return array
+
+    def _new(self, shape: int | tuple[int, ...], dtype: Any) -> wp.array:
+        size = _size(shape, dtype)
+        if self.device.is_cuda or size < SMALLEST:
+            return wp.empty(shape, dtype=dtype, device=self.device)
+        address = _host_pool.allocate(size)
+        return wp.array(ptr=address, shape=shape, dtype=dtype, device=self.device, deleter=_host_pool.deallocate)
 
     def _counted(self, make, shape, dtype) -> wp.array:
         try:
             array = make()
         except (MemoryError, RuntimeError) as error:
-            size = int(np.prod(shape)) * wp.types.type_size_in_bytes(dtype)
+            size = _size(shape, dtype) / 2**20
             raise DeviceError(
-                f"out of memory in pass '{self._scope_name()}': {size / 2**20:.0f} MiB more were asked for on"
+                f"out of memory in pass '{self._scope_name()}': {size:.0f} MiB more were asked for on"
                 f" {self.device.alias} with {self.live_bytes / 2**20:.0f} MiB in use; lower --set volume.resolution or"
                 f" --imageWidth ({error})"
             ) from error
-        size = array.capacity
+        size, key = array.capacity, id(array)
         self.live_bytes += size
         self.peak_bytes = max(self.peak_bytes, self.live_bytes)
-        self._counts[id(array)] = weakref.finalize(array, self._release, id(array), size)
+        self._counts[key] = weakref.ref(array, lambda _: self._release(key, size))
         return array
 
     def hand_over(self, array: wp.array) -> np.ndarray:
         """The values of an array that nothing on the device will use again: on the CPU its own memory, without a copy,
         which from now on is the caller's and no longer counted."""
         if self.device.is_cpu and id(array) in self._counts:
-            self._counts[id(array)]()
+            self._release(id(array), array.capacity)
         return array.numpy()
 
     def _release(self, key: int, size: int) -> None:
         self.live_bytes -= size
         del self._counts[key]
+
+
+def _size(shape: int | tuple[int, ...], dtype: Any) -> int:
+    """Bytes of an array."""
+    elements = shape if isinstance(shape, int) else math.prod(shape)
+    return int(elements) * wp.types.type_size_in_bytes(dtype)
 
 
 def find_device(name: str) -> Any:
