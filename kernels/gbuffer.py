@@ -230,11 +230,10 @@ def _see_synthetic(
 
 @wp.func
 def differs(points: Points, i: int, j: int, paint: int) -> bool:
+    """Whether an edge parts two points of different triangles."""
     role = points.role[i]
     if role != points.role[j]:
         return True
-    if role == BACKGROUND or points.triangle[i] == points.triangle[j]:
-        return False
     if wp.dot(points.normal[i], points.normal[j]) < NORMAL_GAP:
         return True
     offset = points.position[j] - points.position[i]
@@ -254,12 +253,15 @@ def _mark_edges(first: int, points: Points, width: int, height: int, paint: int,
     i = first + wp.tid()
     x = i % width
     y = i / width
+    left = wp.max(x - 1, 0)
+    right = wp.min(x + 1, width - 1)
+    triangle = points.triangle[i]
     mark = int(0)
-    for dy in range(-1, 2):
-        for dx in range(-1, 2):
-            if mark == 0 and x + dx >= 0 and x + dx < width and y + dy >= 0 and y + dy < height:
-                if differs(points, i, (y + dy) * width + x + dx, paint):
-                    mark = 1
+    for row in range(wp.max(y - 1, 0), wp.min(y + 2, height)):
+        for j in range(row * width + left, row * width + right + 1):
+            # Most neighbours show the same triangle.
+            if points.triangle[j] != triangle and mark == 0 and differs(points, i, j, paint):
+                mark = 1
     mark_out[i] = mark
 
 
