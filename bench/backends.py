@@ -105,7 +105,8 @@ def measure(
 def _measure_one(scene: Scene, backend: Backend, options: BackendOptions) -> tuple[dict[str, Any], Layers]:
     from warp_dvct.relighter import Relighter
 
-    shared = {"method": options.method, "quality": options.quality, "settings": options.settings}
+    # One pass after the other, so that each has its own time.
+    shared = {"method": options.method, "quality": options.quality, "settings": options.settings, "overlap": False}
     height = max(1, round(options.width / scene.camera.aspect))
     # A photograph stands in for the camera: grey, since its values decide neither light nor time.
     plate = np.full((height, options.width, 3), 0.5, np.float32)

@@ -81,7 +81,7 @@ def panels(launcher: Launcher, *, width: int, quality: str = "balanced") -> list
 def _picture(launcher: Launcher, scene: Scene, plan: Plan) -> Any:
     device_scene = DeviceScene.upload(launcher, scene, np.asarray(plan.origin), plan.scale)
     lit = light_volumes(launcher, scene, device_scene, plan)
-    return composite(launcher, render(launcher, scene, device_scene, lit, plan, with_before=True), None)
+    return composite(launcher, render(launcher, scene, device_scene, lambda: lit, plan, with_before=True), None)
 
 
 def signed_colors(error: np.ndarray) -> np.ndarray:

@@ -110,7 +110,7 @@ def measure(
     frames: list[list[dict]] = []
     with tempfile.TemporaryDirectory() as folder:
         stage = variant_stage(variant, Path(folder))
-        common = {"quality": quality, "settings": settings, "device": device, "threads": threads}
+        common = {"quality": quality, "settings": settings, "device": device, "threads": threads, "overlap": False}
         Relighter(stage, width=64, height=36, **common).render(np.zeros((36, 64, 3), np.float32))  # compiles
         for _ in trange(runs, desc=variant.name, disable=None, leave=False):
             relighter = Relighter(stage, width=width, height=height, **common)

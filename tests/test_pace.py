@@ -271,7 +271,8 @@ def test_turns_of_as_many_rays_make_the_same_picture(launcher, stage, with_befor
     uploaded = DeviceScene.upload(launcher, scene, np.asarray(plan.origin), plan.scale)
     lit = light_volumes(launcher, scene, uploaded, plan)
     pictures = [
-        render(launcher, scene, uploaded, lit, plan, with_before=with_before, turns=turns) for turns in (None, Even())
+        render(launcher, scene, uploaded, lambda: lit, plan, with_before=with_before, turns=turns)
+        for turns in (None, Even())
     ]
     for name in ("delta", "synthetic", "before") if with_before else ("delta", "synthetic"):
         expected, turned = (getattr(picture, name).numpy() for picture in pictures)

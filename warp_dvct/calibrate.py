@@ -138,7 +138,7 @@ def _measure(
     size = {"width": width, "height": height, "device": launcher.device.alias, "threads": launcher.threads}
     stats = []
     for _ in range(REPEATS):
-        relighter = Relighter(scene, method=method, settings=settings, **size)
+        relighter = Relighter(scene, method=method, settings=settings, overlap=False, **size)
         relighter.render(plate)
         stats.append(_with_rest(relighter.stats, method, by_clock=launcher.device.is_cuda))
         if relighter.stats["cpu_seconds"] > LONG:

@@ -9,14 +9,12 @@ work: each writes its own sum, or a maximum that is atomic there and does not de
 
 from __future__ import annotations
 
-import copy
 import math
 import os
 import time
 import weakref
-from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -26,9 +24,11 @@ import warp as wp
 from warp_dvct.check import Checker, poison
 from warp_dvct.errors import DeviceError, OptionError
 from warp_dvct.host_pool import SMALLEST, HostPool
+from warp_dvct.slabs import Slabs
 
 SLABS_PER_THREAD = 8  # enough that an uneven slab does not leave the other threads idle
 MIN_SLAB_SECONDS = 1.0e-4  # less work is not worth handing to another thread
+ALONE_SECONDS = 1.5e-3  # less is not handed to threads that have something else to do
 FIRST_GUESS = 1.0e-6  # seconds an element, of a kernel that has not run
 PARTS_CUDA = 32  # of a point's rays or a map's splats: a GPU wants more threads than there are points, and short ones
 THREADS_CUDA = 2**20  # beyond which more parts would fill memory and not the GPU
@@ -60,6 +60,8 @@ class Launcher:
         if self.device.is_cuda and self.device.is_mempool_enabled:
             wp.set_mempool_release_threshold(self.device, KEPT_BYTES_CUDA)
         self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
+        self._beside: list[Slabs] = []
+        self._helped_seconds = 0.0  # processor time of the pool's threads
         self.pass_seconds: dict[str, float] = {}
         self.pass_cpu_seconds: dict[str, float] = {}
         self.compile_seconds = 0.0
@@ -84,39 +86,56 @@ class Launcher:
         if self.checker is not None:
             self.checker.after(self._scope_name(), kernel, count, inputs, outputs, self.device)
 
-    def _launch_all(self, kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
-        begun = time.thread_time()
-        key = kernel, self.device.alias
-        cost = _element_seconds.get(key, FIRST_GUESS)
-        slabs = 1 if self._pool is None else min(self.threads * SLABS_PER_THREAD, int(count * cost / MIN_SLAB_SECONDS))
-        if slabs <= 1:
-            self._launch_slab(kernel, 0, count, inputs, outputs)
-            spent = time.thread_time() - begun
-        else:
-            spent = self._launch_parallel(kernel, -(-count // slabs), count, inputs, outputs)
-        _element_seconds[key] = max(spent / count, FORGETTING * cost)
+    @contextmanager
+    def beside(
+        self, kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any] = ()
+    ) -> Iterator[None]:
+        """Run a kernel beside what is done inside, which needs none of its ``outputs`` and leaves its arrays alone.
 
-    def _launch_parallel(self, kernel: wp.Kernel, slab: int, count: int, inputs, outputs) -> float:
-        """Launch in slabs of ``slab`` elements; the processor seconds of all."""
-        assert self._pool is not None
-        waiting = deque(range(0, count, slab))
-        begun = time.thread_time()
-        command = wp.launch(
-            kernel, dim=slab, inputs=[0, *inputs], outputs=list(outputs), device=self.device, record_cmd=True
-        )
-        packing = time.thread_time() - begun
-        # This thread works too: a thread that only waits leaves its core last, and of those it woke two may share one.
-        workers = [
-            self._pool.submit(_launch_slabs, _another(command), waiting, slab, count)
-            for _ in range(min(self.threads, len(waiting)) - 1)
-        ]
+        One thread begins with it; at the end of the block all join. So the cores that short launches leave idle, and
+        Python's own time, are of use. On a GPU, on one thread and where launches are checked, it runs first.
+        """
+        if self._pool is None or self.checker is not None or count <= 0:
+            self.launch(kernel, count, inputs, outputs)
+            yield
+            return
+        self.load(kernel.module)
+        slab = -(-count // (self.threads * SLABS_PER_THREAD))
+        slabs = Slabs(self._pool, kernel, slab, count, inputs, outputs, self.device)
+        slabs.hand_out(1)
+        self._beside.append(slabs)
         try:
-            own = packing + _launch_slabs(command, waiting, slab, count)
-            return own + sum(worker.result() for worker in workers)
+            yield
+            slabs.hand_out(self.threads - 2)
+            self._finish(kernel, count, slabs)
         finally:
-            # After an interrupt the caller frees its arrays: no slab may still be writing to them.
-            waiting.clear()
-            wait(workers)
+            slabs.stop()
+            self._beside.remove(slabs)
+
+    def _launch_all(self, kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
+        seconds = count * self._element_seconds(kernel)
+        slabs = min(self.threads * SLABS_PER_THREAD, int(seconds / MIN_SLAB_SECONDS))
+        busy = sum(work.under_way for work in self._beside) >= self.threads - 1
+        if self._pool is None or slabs <= 1 or (busy and seconds < ALONE_SECONDS):
+            begun = time.thread_time()
+            self._launch_slab(kernel, 0, count, inputs, outputs)
+            self._learn(kernel, count, time.thread_time() - begun)
+            return
+        work = Slabs(self._pool, kernel, -(-count // slabs), count, inputs, outputs, self.device)
+        work.hand_out(self.threads - 1)
+        self._finish(kernel, count, work)
+
+    def _finish(self, kernel: wp.Kernel, count: int, slabs: Slabs) -> None:
+        slabs.finish()
+        self._helped_seconds += slabs.helped
+        self._learn(kernel, count, slabs.seconds)
+
+    def _element_seconds(self, kernel: wp.Kernel) -> float:
+        return _element_seconds.get((kernel, self.device.alias), FIRST_GUESS)
+
+    def _learn(self, kernel: wp.Kernel, count: int, seconds: float) -> None:
+        key = kernel, self.device.alias
+        _element_seconds[key] = max(seconds / count, FORGETTING * self._element_seconds(kernel))
 
     def parts(self, count: int) -> int:
         """Elements that share out the rays of one of ``count`` points, or a map's splats: 1 on the CPU."""
@@ -147,14 +166,14 @@ class Launcher:
         key = (id(module), self.device.alias)
         if key in self._loaded:
             return
-        start, cpu_start = time.perf_counter(), time.process_time()
+        start, cpu_start = time.perf_counter(), self._processor_seconds()
         level, wp.config.log_level = wp.config.log_level, wp.LOG_WARNING
         try:
             # Without it the CPU build is for blocks of 256, which no CPU launch uses: each thread would build again.
             module.load(self.device, block_dim=1 if self.device.is_cpu else None)
         finally:
             wp.config.log_level = level
-        spent, cpu_spent = time.perf_counter() - start, time.process_time() - cpu_start
+        spent, cpu_spent = time.perf_counter() - start, self._processor_seconds() - cpu_start
         self.compile_seconds += spent
         self.compile_cpu_seconds += cpu_spent
         self._exclude(spent, cpu_spent)
@@ -164,21 +183,27 @@ class Launcher:
     def scope(self, name: str) -> Iterator[None]:
         """Add the time spent inside to ``pass_seconds[name]``, without compilation; nested scopes count on their own.
 
-        ``pass_cpu_seconds`` holds the processor time of all threads, which moves less on a busy machine. Running out
-        of memory inside raises DeviceError with the pass's name.
+        ``pass_cpu_seconds`` holds the processor time of all threads, which moves less on a busy machine. A kernel that
+        runs beside (:meth:`beside`) counts where it was launched, by the clock with no more than what is left of it
+        then. Running out of memory inside raises DeviceError with the pass's name.
         """
         scope = [name, 0.0, 0.0]
         self._scopes.append(scope)
-        start, cpu_start = time.perf_counter(), time.process_time()
+        start, cpu_start = time.perf_counter(), self._processor_seconds()
         try:
             yield
             wp.synchronize_device(self.device)
         finally:
             self._scopes.pop()
-            spent, cpu_spent = time.perf_counter() - start - scope[1], time.process_time() - cpu_start - scope[2]
+            cpu_spent = self._processor_seconds() - cpu_start - scope[2]
+            spent = time.perf_counter() - start - scope[1]
             self.pass_seconds[name] = self.pass_seconds.get(name, 0.0) + spent
             self.pass_cpu_seconds[name] = self.pass_cpu_seconds.get(name, 0.0) + cpu_spent
             self._exclude(spent, cpu_spent)
+
+    def _processor_seconds(self) -> float:
+        """Of this thread, and of the pool's in launches that are over."""
+        return time.thread_time() + self._helped_seconds
 
     def _exclude(self, seconds: float, cpu_seconds: float) -> None:
         """Time that the scopes around do not count as their own."""
@@ -277,25 +302,3 @@ def find_device(name: str) -> Any:
     if name not in present:
         raise DeviceError(f"device '{name}' is not present; present: {', '.join(present)}")
     return wp.get_device(name)
-
-
-def _launch_slabs(command: Any, waiting: deque[int], slab: int, count: int) -> float:
-    """Replay a recorded launch for slabs until none is left; the processor seconds that took."""
-    begun = time.thread_time()
-    command.set_param_at_index(0, 0)  # a number of its own: commands of other threads share the rest
-    while True:
-        try:
-            start = waiting.popleft()
-        except IndexError:
-            return time.thread_time() - begun
-        command.set_param_at_index_from_ctype(0, start)
-        if start + slab > count:  # the last of all
-            command.set_dim(count - start)
-        command.launch()
-
-
-def _another(command: Any) -> Any:
-    """The same recorded launch for another thread: packing its arguments anew would hold Python's lock again."""
-    other = copy.copy(command)
-    other.params = list(command.params)
-    return other

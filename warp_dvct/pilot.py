@@ -126,13 +126,15 @@ def make_pilot(
     coarse = needs[1] if len(needs) > 1 else None
     shape, picture, layers = (plan.height, plan.width), PictureNeed(), None
     if plan.changes:
-        radiance = delta_cone_tracing.render(launcher, scene, device_scene, lit, plan, with_before=True, kept=kept)
+        radiance = delta_cone_tracing.render(
+            launcher, scene, device_scene, lambda: lit, plan, with_before=True, kept=kept
+        )
         layers = composite(launcher, radiance, None)
         first = delta_cone_tracing.light_volumes(launcher, scene, device_scene, once, kept)
         others = []
         for light, other in ((first, once), (lit, again)):
             radiance = delta_cone_tracing.render(
-                launcher, scene, device_scene, light, other, with_before=False, kept=kept
+                launcher, scene, device_scene, lambda light=light: light, other, with_before=False, kept=kept
             )
             others.append(composite(launcher, radiance, layers.plate).comp)
         picture = _compare(layers, *others, decay=_decay(_light(lit.volumes), _light(first.volumes)))

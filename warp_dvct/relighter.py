@@ -5,6 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -54,6 +55,8 @@ class Relighter:
         real, synthetic: Prim paths whose role is set against what the stage says.
         strict: Treat anything in the stage that is not modelled as an error.
         purposes, complexity: What is drawn of the stage, and how finely subdivision surfaces; as in ``read_stage``.
+        overlap: Let passes that do not need one another run at once. By the clock, ``stats`` then do not tell how long
+            each takes: the direct light's is what was left of it after the volumes.
         check: Look at what every kernel wrote; a number that is not finite or out of its range is a CheckError that
             names pass, pixel and inputs. About twice as slow.
     Raises:
@@ -79,12 +82,14 @@ class Relighter:
         strict: bool = False,
         purposes: Sequence[str] = ("default", "render"),
         complexity: str = "high",
+        overlap: bool = True,
         check: bool = False,
     ) -> None:
         if method not in METHODS:
             raise OptionError(f"method is '{method}'; choose one of {', '.join(METHODS)}")
         self.settings = make_settings(quality, settings)
         self._given = dict(settings or {})
+        self._overlap = overlap
         self.method = method
         self._launcher = Launcher(device, threads, check=check)
         self._stage = stage
@@ -280,31 +285,36 @@ class Relighter:
             self._uploaded = (key, uploaded, None)
         return replace(self._uploaded[1], camera=camera_frame(self._drawn.camera, origin, scale))
 
-    def _lit(self, kind: type[LitKind], make: Callable[[DeviceScene], LitKind]) -> tuple[DeviceScene, LitKind]:
-        """The scene on the device and what the method made of its light, kept until something else than the camera
+    def _lit(self, kind: type[LitKind], make: Callable[[], LitKind]) -> LitKind:
+        """What the method made of the light of the scene on the device, kept until something else than the camera
         changes."""
-        device_scene = self._device_scene()
         assert self._uploaded is not None
         lit = self._uploaded[2]
         if not isinstance(lit, kind):
-            lit = make(device_scene)
+            lit = make()
             self._uploaded = (self._uploaded[0], self._uploaded[1], lit)
-        return device_scene, lit
+        return lit
 
     def _delta_cones(self, with_before: bool, report: Progress) -> Radiance:
-        report("volumes", 0.0)
         launcher, scene, plan = self._launcher, self._drawn, self.plan
-        device_scene, light_field = self._lit(
-            delta_cone_tracing.LightField,
-            lambda uploaded: delta_cone_tracing.light_volumes(launcher, scene, uploaded, plan, self._kept),
-        )
+        report("upload", 0.0)
+        device_scene = self._device_scene()
+
+        def lit() -> delta_cone_tracing.LightField:
+            report("volumes", 0.2)
+            make = partial(delta_cone_tracing.light_volumes, launcher, scene, device_scene, plan, self._kept)
+            light_field = self._lit(delta_cone_tracing.LightField, make)
+            report("shading", 0.5)
+            return light_field
+
         turns, pace = None, None if isinstance(self._pace, SamplePace) else self._pace
-        if pace is not None:
+        ready = lit() if pace is not None or not self._overlap else None
+        if pace is not None and ready is not None:
             with launcher.scope("settle"):
-                turns = pace.settle(launcher, scene, device_scene, light_field, self.settings)
-        report("shading", 0.5)
+                turns = pace.settle(launcher, scene, device_scene, ready, self.settings)
+        light = lit if ready is None else lambda: ready
         radiance = delta_cone_tracing.render(
-            launcher, scene, device_scene, light_field, plan, with_before=with_before, kept=self._kept, turns=turns
+            launcher, scene, device_scene, light, plan, with_before=with_before, kept=self._kept, turns=turns
         )
         if pace is not None and turns is not None:
             self._pace, self.settings = None, pace.end(turns)
@@ -314,9 +324,9 @@ class Relighter:
     def _instant_radiosity(self, plate: np.ndarray | None, ldr: bool, report: Progress) -> Radiance:
         report("virtual point lights", 0.0)
         launcher, scene, plan = self._launcher, self._drawn, self.plan
-        device_scene, shot = self._lit(
-            instant_radiosity.Shot, lambda uploaded: instant_radiosity.Shot(launcher, scene, uploaded, plan)
-        )
+        device_scene = self._device_scene()
+        make = partial(instant_radiosity.Shot, launcher, scene, device_scene, plan)
+        shot = self._lit(instant_radiosity.Shot, make)
         report("shading", 0.3)
         difference = plan.settings.difference
         wanted = difference == "tonemapped" or (difference == "auto" and ldr)

@@ -10,6 +10,8 @@ nothing.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,7 +44,7 @@ from warp_dvct.passes.patches import bounce_field, choose_patches
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
 from warp_dvct.passes.resolve import resolve
 from warp_dvct.passes.rsm import render_real, render_rsm
-from warp_dvct.passes.shading import direct_settings, shade_direct
+from warp_dvct.passes.shading import direct_settings, shade_direct, shade_direct_beside
 from warp_dvct.passes.specular import find_glossy, shade_specular
 from warp_dvct.passes.voxels import Voxels, cut_triangles, part, voxelize
 from warp_dvct.plan import Plan
@@ -107,7 +109,7 @@ def render(
     launcher: Launcher,
     scene: Scene,
     device_scene: DeviceScene,
-    light_field: LightField,
+    lit: Callable[[], LightField],
     plan: Plan,
     *,
     with_before: bool,
@@ -117,11 +119,12 @@ def render(
     """Shade what the camera sees (Franke 2014, section 3.3): direct, indirect diffuse, indirect specular, resolve.
 
     Args:
+        lit: Gives the lit volumes. Shadow rays need none of them, so cores that this leaves idle trace those.
         with_before: Also render the real scene alone, to serve as the plate.
         kept: Holds what the real scene and the camera alone decide from frame to frame.
         turns: Decide how many rays are gathered instead of the plan's settings.
     """
-    settings, world = plan.settings, light_field.world
+    settings = plan.settings
     with launcher.scope("gbuffer"):
         view = None
         if kept is not None:
@@ -147,16 +150,18 @@ def render(
     light = (launcher.empty if shaded else launcher.zeros)(buffer.count, wp.vec3)
     before = launcher.zeros(buffer.count if with_before else 1, wp.vec3)
     hidden_before = launcher.zeros(max(1, buffer.behind_count), wp.vec3)
+    parts = []
     if shaded:
-        rays = _kept_rays(launcher, scene, plan, kept) if _has_indirect(scene, plan) else None
-        hits = glossy_hits(launcher, scene, device_scene, light_field.bounces, settings.seed)
-        parts = [_Part(buffer.points, buffer.count, light, before, with_before)]
+        parts.append(_Part(buffer.points, buffer.count, light, before, with_before))
         if with_before:
             spare = launcher.zeros(max(1, buffer.behind_count), wp.vec3)
             parts.append(_Part(buffer.behind, buffer.behind_count, spare, hidden_before, True))
+    light_field = _shade_direct(launcher, device_scene, plan, lit, parts)
+    world = light_field.world
+    if shaded:
+        rays = _kept_rays(launcher, scene, plan, kept) if _has_indirect(scene, plan) else None
+        hits = glossy_hits(launcher, scene, device_scene, light_field.bounces, settings.seed)
         for part in parts:
-            with launcher.scope("direct"):
-                _shade_direct(launcher, device_scene, plan, world, part)
             if _has_indirect(scene, plan):
                 with launcher.scope("gather"):
                     irradiance = _irradiance(launcher, device_scene, plan, world, hits, buffer, part, rays, turns)
@@ -324,24 +329,30 @@ def _cone(plan: Plan, aperture: float = 0.0) -> Any:
     return cone
 
 
-def _shade_direct(launcher: Launcher, device_scene: DeviceScene, plan: Plan, world: Any, part: _Part) -> None:
+def _shade_direct(
+    launcher: Launcher, device_scene: DeviceScene, plan: Plan, lit: Callable[[], LightField], parts: list[_Part]
+) -> LightField:
+    """Write the direct light of the parts, and light the volumes."""
     settings = plan.settings
     rays = settings.glossy_rays if plan.glossy and settings.glossy == "rays" else 0
-    cone = None
+
+    def how(part: _Part) -> dict[str, Any]:
+        direct = direct_settings(plan, glossy_rays=rays, with_before=part.with_before)
+        return {"direct": direct, "light": part.light, "before": part.before}
+
     if settings.shadows == "cone":
+        light_field = lit()
         cone = _cone(plan)
         cone.split = cones.DUAL  # a shadow needs both occupancies
-    shade_direct(
-        launcher,
-        device_scene,
-        part.points,
-        part.count,
-        direct_settings(plan, glossy_rays=rays, with_before=part.with_before),
-        light=part.light,
-        before=part.before,
-        world=world,
-        cone=cone,
-    )
+        with launcher.scope("direct"):
+            for part in parts:
+                world = light_field.world
+                shade_direct(launcher, device_scene, part.points, part.count, **how(part), world=world, cone=cone)
+        return light_field
+    with launcher.scope("direct"), ExitStack() as beside:
+        for part in parts:
+            beside.enter_context(shade_direct_beside(launcher, device_scene, part.points, part.count, **how(part)))
+        return lit()
 
 
 def _kept_rays(launcher: Launcher, scene: Scene, plan: Plan, kept: Kept | None) -> Any:

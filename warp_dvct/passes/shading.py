@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from warp_dvct.device_scene import DeviceScene
@@ -28,6 +30,16 @@ def direct_settings(plan: Plan, *, glossy_rays: int, with_before: bool) -> Any:
     return direct
 
 
+@contextmanager
+def shade_direct_beside(
+    launcher: Launcher, scene: DeviceScene, points: Any, count: int, direct: Any, *, light: Any, before: Any
+) -> Iterator[None]:
+    """As :func:`shade_direct` by shadow rays, beside what is done inside (:meth:`Launcher.beside`)."""
+    inputs = [points, scene.geometry, scene.lights, direct]
+    with launcher.beside(kernels._shade_direct, count, inputs, [light, before]):
+        yield
+
+
 def shade_direct(
     launcher: Launcher,
     scene: DeviceScene,
@@ -49,7 +61,8 @@ def shade_direct(
     Franke 2014, eqs. 5 and 7: after on synthetic points, after - before on real ones. Domes are left to the gather.
     """
     if cone is None:
-        launcher.launch(kernels._shade_direct, count, [points, scene.geometry, scene.lights, direct], [light, before])
+        with shade_direct_beside(launcher, scene, points, count, direct, light=light, before=before):
+            pass
     else:
         launcher.launch(
             kernels._shade_direct_cones,
