@@ -6,6 +6,7 @@ irradiance are invariant, and the radiant intensity of POINT lights is multiplie
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,11 +82,13 @@ class DeviceScene:
         _check_indices(scene)
         host = _HostTriangles.gather(scene, origin, scale)
         kept = kept or Kept()
-        real = kept.get("real triangles", None, lambda: _build_mesh(launcher, host.triangles[: host.synthetic_first]))
-        synthetic = _build_mesh(launcher, host.triangles[host.synthetic_first :])
-        geometry = _upload_geometry(launcher, host, real, synthetic)
+        building = _begin_mesh(launcher, host.triangles[host.synthetic_first :])
+        first = host.synthetic_first
+        real = kept.get("real triangles", None, lambda: _mesh(*_mesh_arrays(launcher, host.triangles[:first])))
         materials = _upload_materials(launcher, scene.materials, scene.textures)
         lights = upload_lights(launcher, scene.lights, origin, scale)
+        synthetic = building()
+        geometry = _upload_geometry(launcher, host, real, synthetic)
         double_sided = _both_sides(launcher, host, geometry, materials, lights)
         geometry.double_sided = launcher.array(double_sided, wp.int32)
         return DeviceScene(
@@ -178,12 +181,19 @@ def _check_range(mesh: Mesh, what: str, indices: np.ndarray, count: int) -> None
         )
 
 
-def _build_mesh(launcher: Launcher, triangles: np.ndarray) -> Any:
-    if not len(triangles):
-        return None
-    points = launcher.array(triangles.reshape(-1, 3), wp.vec3)
-    indices = launcher.array(np.arange(3 * len(triangles), dtype=np.int32), wp.int32)
-    return wp.Mesh(points=points, indices=indices)
+def _begin_mesh(launcher: Launcher, triangles: np.ndarray) -> Callable[[], Any]:
+    """Triangles with their tree, which a thread of its own builds; the result waits for it."""
+    arrays = _mesh_arrays(launcher, triangles)
+    return launcher.apart(lambda: _mesh(*arrays))
+
+
+def _mesh_arrays(launcher: Launcher, triangles: np.ndarray) -> tuple[Any, Any]:
+    indices = np.arange(3 * len(triangles), dtype=np.int32)
+    return launcher.array(triangles.reshape(-1, 3), wp.vec3), launcher.array(indices, wp.int32)
+
+
+def _mesh(points: Any, indices: Any) -> Any:
+    return wp.Mesh(points=points, indices=indices) if len(indices) else None
 
 
 def _both_sides(launcher: Launcher, host: _HostTriangles, geometry: Any, materials: Any, lights: Any) -> np.ndarray:

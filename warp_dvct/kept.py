@@ -64,7 +64,7 @@ def content_key(*values: Any) -> str:
 
     def feed(value: Any) -> None:
         if isinstance(value, np.ndarray):
-            digest.update(str((value.shape, value.dtype)).encode())
+            digest.update(f"{value.shape}{value.dtype.str}".encode())
             digest.update(np.ascontiguousarray(value).data)
         elif hasattr(value, "__dataclass_fields__"):
             for name in value.__dataclass_fields__:

@@ -13,10 +13,10 @@ import math
 import os
 import time
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
@@ -34,6 +34,8 @@ PARTS_CUDA = 32  # of a point's rays or a map's splats: a GPU wants more threads
 THREADS_CUDA = 2**20  # beyond which more parts would fill memory and not the GPU
 KEPT_BYTES_CUDA = 2**30  # freed memory that is kept for the next arrays: to return it and ask again takes 0.1 ms each
 FORGETTING = 0.7  # of the dearest launch so far, per launch: kernels are launched with light and heavy elements in turn
+
+Made = TypeVar("Made")
 
 _host_pool = HostPool()  # of all launchers: frames from scratch follow one another too
 # Seconds an element took in each kernel's launches so far, by kernel and device: they decide the slabs, never a result.
@@ -111,6 +113,16 @@ class Launcher:
         finally:
             slabs.stop()
             self._beside.remove(slabs)
+
+    def apart(self, make: Callable[[], Made]) -> Callable[[], Made]:
+        """Begin ``make`` on another thread, where there is one; what is returned waits for its result.
+
+        For work in libraries that leave Python's lock alone; it must not use this launcher.
+        """
+        if self._pool is None:
+            made = make()
+            return lambda: made
+        return self._pool.submit(make).result
 
     def _launch_all(self, kernel: wp.Kernel, count: int, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
         seconds = count * self._element_seconds(kernel)

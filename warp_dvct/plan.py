@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -142,7 +142,8 @@ def make_plan(
 
         passes = plan_passes(scene, settings, width * height, glossy, changes, has_plate)
     else:
-        passes = _passes(scene, settings, width * height, fine, coarse, scale, origin, maps, glossy, changes, has_plate)
+        held = _volume_bytes(scene, [fine] if coarse is None else [fine, coarse], scale, origin)
+        passes = _passes(scene, settings, width * height, held, maps, glossy, changes, has_plate)
     return Plan(
         method,
         settings,
@@ -158,6 +159,16 @@ def make_plan(
         changes,
         passes,
     )
+
+
+def for_plate(plan: Plan, scene: Scene, has_plate: bool) -> Plan:
+    """The plan of the same picture where a plate will be given, or will not."""
+    if plan.method != "delta-cones":
+        return make_plan(scene, plan.settings, plan.method, plan.width, plan.height, has_plate=has_plate)
+    pixels = plan.width * plan.height
+    held = next(p.bytes for p in plan.passes if p.name == "voxelize")  # all triangles would have to be looked at
+    passes = _passes(scene, plan.settings, pixels, held, plan.maps, plan.glossy, plan.changes, has_plate)
+    return replace(plan, passes=passes)
 
 
 def _coarse_box(scene: Scene, frame: VolumeFrame, settings: Settings) -> Box | None:
@@ -305,10 +316,7 @@ def _passes(
     scene: Scene,
     settings: Settings,
     pixels: int,
-    fine: Box,
-    coarse: Box | None,
-    scale: float,
-    origin: np.ndarray,
+    volume_bytes: int,
     maps: tuple[MapPlan, ...],
     glossy: bool,
     changes: bool,
@@ -332,7 +340,7 @@ def _passes(
             "voxelize",
             needs_volume,
             "real and synthetic surfaces" if needs_volume else no_indirect,
-            _volume_bytes(scene, [fine] if coarse is None else [fine, coarse], scale, origin),
+            volume_bytes,
         ),
     ]
     for m in maps:

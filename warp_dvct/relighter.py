@@ -21,7 +21,7 @@ from warp_dvct.methods import delta_cone_tracing, instant_radiosity, path_tracin
 from warp_dvct.passes.composite import composite
 from warp_dvct.passes.difference import tonemap_difference
 from warp_dvct.passes.lens import LensView
-from warp_dvct.plan import Plan, make_plan
+from warp_dvct.plan import Plan, for_plate, make_plan
 from warp_dvct.sample_pace import SamplePace
 from warp_dvct.scene import Notice, Role, Scene
 from warp_dvct.scene_check import check_scene
@@ -206,7 +206,8 @@ class Relighter:
             self._pace.begin(launcher)
         self._had_plate = plate is not None
         if self._planned_plate != self._had_plate:
-            self._plan(has_plate=self._had_plate)
+            self._planned_plate = self._had_plate
+            self._current_plan = for_plate(self._current_plan, self._drawn, self._had_plate)
         require_memory(self.plan, launcher.device)
         if self.method == "path-trace":
             radiance = self._path_trace(report)
