@@ -249,8 +249,9 @@ class Launcher:
         """Copy host values to the device, counted in ``peak_bytes``; the copy never aliases ``values``."""
         values = np.ascontiguousarray(values)
         if self.device.is_cuda or values.nbytes < SMALLEST:
-            make = lambda: wp.array(values, dtype=dtype, device=self.device, copy=True)  # noqa: E731
-            return self._counted(make, values.shape, dtype)
+            return self._counted(
+                lambda: wp.array(values, dtype=dtype, device=self.device, copy=True), values.shape, dtype
+            )
         given = wp.array(values, dtype=dtype, device=self.device, copy=False)
         array = self._counted(lambda: self._new(given.shape, dtype), given.shape, dtype)
         wp.copy(array, given)
