@@ -20,10 +20,12 @@ from warp_dvct.kernels.geometry import (
     FAR,
     Geometry,
     Hit,
+    no_hit,
     trace_real,
     trace_synthetic,
 )
 from warp_dvct.kernels.glossy_hits import GlossyHits, Sent, focused
+from warp_dvct.kernels.hull import body_left, clear_of_objects
 from warp_dvct.kernels.materials import (
     Surface,
     fresnel,
@@ -214,6 +216,7 @@ def gather_at(
     total = Gathered()
     slot = part[0] * part[2] + part[1]
     s = load_surface(points, j)
+    body = body_left(geo, s)
     even = share_of(rays, points, j, edge_samples)
     few = int(float(even) * aimed)
     aim = aim_at(targets, s, few)
@@ -242,7 +245,9 @@ def gather_at(
             keeps = kept_out.present != 0 and k < even
             at = part[0] * rays + k
             ray.real = kept_real(kept_out, keeps, keeps and known, at, geo, ray.origin, ray.direction)
-            ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
+            ray.synthetic = no_hit(ray.real.t)
+            if not clear_of_objects(geo, body, s.normal_g, ray.origin, ray.direction, ray.real.t):
+                ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
             light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
             light = focused_incident(light, hits, geo, world, ray, start + k)
             total = add_light(total, light, weight)

@@ -26,6 +26,11 @@ class Geometry:
     synthetic_first: int
     center: wp.vec3  # middle of a box that holds the synthetic triangles
     extent: wp.vec3  # half its edges
+    bodies: int  # synthetic objects, or 1 that stands for all of them where they are many
+    body_center: wp.array(dtype=wp.vec3)  # middle of the box around each
+    body_extent: wp.array(dtype=wp.vec3)  # half its edges
+    body_middle: wp.array(dtype=wp.vec3)  # mean of its vertices
+    hull: wp.array(dtype=int)  # [synthetic triangles], the body on whose convex hull a triangle lies, or -1
     corner_normals: wp.array(dtype=wp.vec3)  # zero where the triangle is faceted
     corner_uvs: wp.array(dtype=wp.vec2)
     corner_colors: wp.array(dtype=wp.vec3)
@@ -127,21 +132,27 @@ def trace_real(geo: Geometry, origin: wp.vec3, direction: wp.vec3, t_max: float)
 
 
 @wp.func
-def may_meet_synthetic(geo: Geometry, origin: wp.vec3, direction: wp.vec3, t_max: float) -> bool:
-    """Whether a ray passes the box around the synthetic triangles; most do not, and asking their tree costs more."""
-    if geo.has_synthetic == 0:
-        return False
-    toward = geo.center - origin
+def meets_box(center: wp.vec3, extent: wp.vec3, origin: wp.vec3, direction: wp.vec3, t_max: float) -> bool:
+    """Whether a ray passes a box, given by its middle and half its edges, closer than ``t_max``."""
+    toward = center - origin
     enter = float(0.0)
     leave = float(t_max)
     for axis in range(3):
         # No component is 0: the slab of an axis across the ray then holds all of it, or none.
         inverse = 1.0 / (direction[axis] + wp.where(direction[axis] < 0.0, -1.0e-12, 1.0e-12))
         middle = toward[axis] * inverse
-        half = geo.extent[axis] * wp.abs(inverse)
+        half = extent[axis] * wp.abs(inverse)
         enter = wp.max(enter, middle - half)
         leave = wp.min(leave, middle + half)
     return enter <= leave
+
+
+@wp.func
+def may_meet_synthetic(geo: Geometry, origin: wp.vec3, direction: wp.vec3, t_max: float) -> bool:
+    """Whether a ray passes the box around the synthetic triangles; most do not, and asking their tree costs more."""
+    if geo.has_synthetic == 0:
+        return False
+    return meets_box(geo.center, geo.extent, origin, direction, t_max)
 
 
 @wp.func

@@ -14,6 +14,7 @@ from warp_dvct.kernels.gbuffer import (
     share_of,
 )
 from warp_dvct.kernels.geometry import Geometry, occluded_by_real, occluded_by_synthetic
+from warp_dvct.kernels.hull import body_left, clear_of_objects
 from warp_dvct.kernels.lights import ADDED, DISK, DISTANT, DOME, RECT, Lights, LightSample, sample_light
 from warp_dvct.kernels.materials import (
     Surface,
@@ -294,6 +295,7 @@ def light_part(
     seen_before = float(0.0)
     seen_after = float(0.0)
     traced = int(0)
+    body = body_left(geo, s)
     samples = int(draw.samples)
     tracing = bool(True)
     count = int(0)
@@ -303,7 +305,9 @@ def light_part(
         open += f
         if tracing and wp.max(f[0], wp.max(f[1], f[2])) > 0.0:
             origin = spawn_point(s, light.direction)
-            sight = look(geo, origin, light.direction, light.distance * SHADOW_END, both, shadowed)
+            reach = light.distance * SHADOW_END
+            meets = shadowed and not clear_of_objects(geo, body, s.normal_g, origin, light.direction, reach)
+            sight = look(geo, origin, light.direction, reach, both, meets)
             sum_before += f * sight.before
             sum_after += f * sight.after
             seen_before += sight.before

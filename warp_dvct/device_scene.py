@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_dvct.boxes import around_runs, middle_and_half
 from warp_dvct.errors import StageError
 from warp_dvct.kept import Kept
 from warp_dvct.kernels.geometry import FAR, CameraFrame, Geometry
 from warp_dvct.kernels.lights import Lights
 from warp_dvct.kernels.materials import Materials
 from warp_dvct.launch import Launcher
+from warp_dvct.passes.hull import mark_hulls
 from warp_dvct.passes.sidedness import lit_from_behind
 from warp_dvct.scene import Camera, Light, LightKind, Material, Mesh, Role, Scene, Texture
 from warp_dvct.targets import targets_of
@@ -27,7 +29,6 @@ from warp_dvct.targets import targets_of
 BACKS_MET = 4
 # Sine of the angle between a flat light's plane and its direction, below which float32 axes do not tell the side.
 LEAST_SIDE = 1e-6
-BOX_MARGIN = 1e-3  # of the largest edge of the box around the objects: keeps rounding from culling a ray at its border
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,9 @@ class DeviceScene:
         materials = _upload_materials(launcher, scene.materials, scene.textures)
         lights = upload_lights(launcher, scene.lights, origin, scale)
         synthetic = building()
-        geometry = _upload_geometry(launcher, host, real, synthetic)
+        boxes = host.boxes(first)
+        geometry = _upload_geometry(launcher, host, real, synthetic, boxes)
+        mark_hulls(launcher, geometry, boxes, host.synthetic_vertices, host.synthetic_counts)
         double_sided = _both_sides(launcher, host, geometry, materials, lights)
         geometry.double_sided = launcher.array(double_sided, wp.int32)
         return DeviceScene(
@@ -98,7 +101,7 @@ class DeviceScene:
             camera=camera_frame(scene.camera, origin, scale),
             real=real,
             synthetic=synthetic,
-            targets=targets_of(host.boxes(host.synthetic_first) if synthetic is not None else np.zeros((0, 2, 3))),
+            targets=targets_of(boxes),
             triangles_vs=host.triangles,
             role=host.role,
             double_sided=double_sided,
@@ -126,19 +129,22 @@ class _HostTriangles:
     mesh: np.ndarray
     scanned: np.ndarray
     synthetic_first: int
+    synthetic_vertices: list[np.ndarray]
+    synthetic_counts: list[int]
 
     def boxes(self, first: int = 0) -> np.ndarray:
         """Low and high corners of each mesh from triangle ``first`` on, ``[m, 2, 3]``."""
         # Over rows: NumPy's reductions of [t, 3, 3] take 20 times as long.
         corners = self.triangles[first:].reshape(-1, 3)
-        starts = 3 * np.flatnonzero(np.diff(self.mesh[first:], prepend=-1))
-        return np.stack([np.minimum.reduceat(corners, starts), np.maximum.reduceat(corners, starts)], 1)
+        return around_runs(corners, 3 * np.flatnonzero(np.diff(self.mesh[first:], prepend=-1)))
 
     @staticmethod
     def gather(scene: Scene, origin: np.ndarray, scale: float) -> _HostTriangles:
         """All triangles, real meshes first; absent normals become 0 (faceted), uvs 0 and colours 1."""
         meshes = sorted((m for m in scene.meshes if len(m.triangles)), key=lambda m: int(m.role))
         counts = [len(m.triangles) for m in meshes]
+        first = sum(m.role == Role.REAL for m in meshes)
+        vertices = [((m.points - origin) * scale).astype(np.float32) for m in meshes]
 
         def corners(values, width: int, absent: float) -> np.ndarray:
             parts = [
@@ -151,7 +157,7 @@ class _HostTriangles:
             return np.concatenate([np.zeros(0, np.int32), *(np.asarray(v, np.int32) for v in values)])
 
         return _HostTriangles(
-            triangles=corners([(m.points[m.triangles] - origin) * scale for m in meshes], 3, 0.0),
+            triangles=corners([v[m.triangles] for v, m in zip(vertices, meshes, strict=True)], 3, 0.0),
             normals=corners([m.corner_normals for m in meshes], 3, 0.0),
             uvs=corners([m.corner_uvs for m in meshes], 2, 0.0),
             colors=corners([m.corner_colors for m in meshes], 3, 1.0),
@@ -160,7 +166,9 @@ class _HostTriangles:
             role=each([np.full(n, m.role) for m, n in zip(meshes, counts, strict=True)]),
             mesh=each([np.full(n, i) for i, n in enumerate(counts)]),
             scanned=each([np.full(n, m.scanned) for m, n in zip(meshes, counts, strict=True)]),
-            synthetic_first=sum(n for m, n in zip(meshes, counts, strict=True) if m.role == Role.REAL),
+            synthetic_first=sum(counts[:first]),
+            synthetic_vertices=vertices[first:],
+            synthetic_counts=counts[first:],
         )
 
 
@@ -208,7 +216,7 @@ def _both_sides(launcher: Launcher, host: _HostTriangles, geometry: Any, materia
     return np.where(met[host.mesh] >= BACKS_MET, 1, host.double_sided).astype(np.int32)
 
 
-def _upload_geometry(launcher: Launcher, host: _HostTriangles, real: Any, synthetic: Any) -> Any:
+def _upload_geometry(launcher: Launcher, host: _HostTriangles, real: Any, synthetic: Any, boxes: np.ndarray) -> Any:
     geometry = Geometry()
     geometry.has_real = int(real is not None)
     geometry.has_synthetic = int(synthetic is not None)
@@ -216,10 +224,9 @@ def _upload_geometry(launcher: Launcher, host: _HostTriangles, real: Any, synthe
     geometry.synthetic = wp.uint64(synthetic.id if synthetic is not None else 0)
     geometry.synthetic_first = host.synthetic_first
     if synthetic is not None:
-        boxes = host.boxes(host.synthetic_first)
-        low, high = boxes[:, 0].min(0), boxes[:, 1].max(0)
-        geometry.center = wp.vec3(*(0.5 * (low + high)))
-        geometry.extent = wp.vec3(*(0.5 * (high - low) + BOX_MARGIN * float(np.max(high - low))))
+        whole = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])[None]
+        center, extent = middle_and_half(whole)
+        geometry.center, geometry.extent = wp.vec3(*center[0]), wp.vec3(*extent[0])
     geometry.corner_normals = launcher.array(host.normals.reshape(-1, 3), wp.vec3)
     geometry.corner_uvs = launcher.array(host.uvs.reshape(-1, 2), wp.vec2)
     geometry.corner_colors = launcher.array(host.colors.reshape(-1, 3), wp.vec3)

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_dvct.boxes import middle_and_half
 from warp_dvct.kernels.aim import Targets
 
 MANY = 24  # boxes from which on neighbours are joined first: all pairs are compared, in every frame
 APART = 0.5  # of the surface of the box around all, below which two boxes pay: at 0.7, as in rooms, nothing is gained
-MARGIN = 1e-3  # of the largest edge: keeps rounding from emptying flat boxes
 
 
 def targets_of(boxes: np.ndarray) -> Any:
@@ -27,9 +27,7 @@ def make_targets(boxes: np.ndarray) -> Any:
     """``Targets`` of up to two boxes, ``[0 to 2, 2, 3]``, a little larger than they are."""
     targets = Targets()
     targets.count = len(boxes)
-    low, high = boxes[:, 0], boxes[:, 1]
-    center = [wp.vec3(*c) for c in 0.5 * (low + high)]
-    extent = [wp.vec3(*e) for e in 0.5 * (high - low) + MARGIN * (high - low).max(1, initial=0.0, keepdims=True)]
+    center, extent = ([wp.vec3(*v) for v in vectors] for vectors in middle_and_half(boxes))
     if len(boxes) > 0:
         targets.center, targets.extent = center[0], extent[0]
     if len(boxes) > 1:

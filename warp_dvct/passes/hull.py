@@ -1,0 +1,69 @@
+"""Which synthetic triangles lie on the convex hull of their object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_dvct.boxes import around_runs, middle_and_half
+from warp_dvct.kernels import hull as kernels
+from warp_dvct.launch import Launcher
+
+MOST_BODIES = 8  # objects with a box of their own, which rays are tested against one after the other
+MOST_TRIANGLES = 2**16  # of a body: all of its vertices are looked at for each, which takes longer than it saves then
+CELLS = 32  # an edge of the grid by which vertices are grouped
+
+
+def mark_hulls(
+    launcher: Launcher, geometry: Any, boxes: np.ndarray, vertices: Sequence[np.ndarray], counts: Sequence[int]
+) -> None:
+    """Fill in what ``geometry`` says of bodies and hulls.
+
+    Args:
+        geometry: ``kernels.geometry.Geometry`` with the synthetic triangles.
+        boxes: Low and high corners of each synthetic mesh's box, ``[m, 2, 3]``, in volume space.
+        vertices: Of each, float32 ``[v, 3]``. counts: Its triangles, in the order of the meshes.
+    """
+    if len(counts) > MOST_BODIES:
+        boxes = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])[None]
+        vertices, counts = [np.concatenate(vertices)], [sum(counts)]
+    triangles = sum(counts)
+    center, extent = middle_and_half(boxes)
+    middle = np.array([v.mean(0, dtype=np.float64) for v in vertices], np.float32).reshape(-1, 3)
+    geometry.bodies = len(counts)
+    geometry.body_center = launcher.array(center, wp.vec3)
+    geometry.body_extent = launcher.array(extent, wp.vec3)
+    geometry.body_middle = launcher.array(middle, wp.vec3)
+    geometry.hull = launcher.empty(triangles, wp.int32)
+    asked = np.array([k if n <= MOST_TRIANGLES else kernels.NO_BODY for k, n in enumerate(counts)], np.int32)
+    bodies = _grouped(launcher, vertices)
+    bodies.of_triangle = launcher.array(np.repeat(asked, counts), wp.int32)
+    launcher.launch(kernels._mark_hull, triangles, [geometry, bodies], [geometry.hull])
+
+
+def _grouped(launcher: Launcher, vertices: Sequence[np.ndarray]) -> Any:
+    """``Bodies`` without their triangles."""
+    small, large = int(kernels.SMALL), int(kernels.SMALL * kernels.IN_LARGE)
+    # The last vertex fills a body's last boxes.
+    blocks = [np.pad(v[_along_z_curve(v)], ((0, -len(v) % large), (0, 0)), "edge") for v in vertices]
+    ordered = np.concatenate([np.zeros((0, 3), np.float32), *blocks])
+    bodies = kernels.Bodies()
+    bodies.first = launcher.array(np.cumsum([0, *(len(b) // large for b in blocks)]).astype(np.int32), wp.int32)
+    bodies.vertex = launcher.array(ordered, wp.vec3)
+    center, extent = middle_and_half(around_runs(ordered, np.arange(0, len(ordered), small)))
+    bodies.center, bodies.extent = launcher.array(center, wp.vec3), launcher.array(extent, wp.vec3)
+    center, extent = middle_and_half(around_runs(ordered, np.arange(0, len(ordered), large)))
+    bodies.large_center, bodies.large_extent = launcher.array(center, wp.vec3), launcher.array(extent, wp.vec3)
+    return bodies
+
+
+def _along_z_curve(points: np.ndarray) -> np.ndarray:
+    """An order in which neighbours follow one another."""
+    low = points.min(0)
+    size = max(float(np.max(points.max(0) - low)), 1e-30)
+    cell = np.minimum((points - low) * (CELLS / size), CELLS - 1).astype(np.int16)
+    spread = np.array([sum(((i >> b) & 1) << (3 * b) for b in range(5)) for i in range(CELLS)], np.int16)
+    return np.argsort(spread[cell[:, 0]] | spread[cell[:, 1]] << 1 | spread[cell[:, 2]] << 2, kind="stable")
