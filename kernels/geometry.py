@@ -207,8 +207,8 @@ def largest_coordinate(p: wp.vec3) -> float:
 def offset_point(position: wp.vec3, normal: wp.vec3) -> wp.vec3:
     """``position`` moved off its surface towards ``normal``, for points whose triangle is about as near as they are.
 
-    In volume space the box is the unit cube, so the step never falls below that of coordinate 1. Where the triangle is
-    known, ``materials.spawn_point`` also covers triangles that reach much farther out than the point.
+    The fine volume's edge is 1 in volume space, so the step never falls below that of coordinate 1. Where the triangle
+    is known, ``materials.spawn_point`` also covers triangles that reach much farther out than the point.
     """
     return position + normal * (OFFSET_RELATIVE * wp.max(largest_coordinate(position), 1.0))
 

@@ -145,15 +145,45 @@ def test_the_box_goes_in_steps_and_holds_the_objects(scale):
         assert bounds is not None
         low, high = bounds
         frame = volume_frame(moment, scale)
-        assert (low >= frame.origin - 1e-12).all()
-        assert (high <= frame.origin + frame.edge + 1e-12).all()
+        corner = frame.origin + frame.fine * frame.edge
+        assert (low >= corner - 1e-12).all()
+        assert (high <= corner + frame.edge + 1e-12).all()
         asked = scale * (high - low).max()
         assert frame.edge > asked * 0.917
         assert frame.edge < max(asked * 1.091, (high - low).max() * 8 / 7 * 1.19)
-        assert (np.abs(frame.origin + 0.5 * frame.edge - 0.5 * (low + high)) <= frame.edge / 16 + 1e-12).all()
+        assert (np.abs(corner + 0.5 * frame.edge - 0.5 * (low + high)) <= frame.edge / 16 + 1e-12).all()
         np.testing.assert_allclose(frame.origin + frame.low * frame.edge, 0.05, atol=1e-12)
-        frames.add((*frame.origin, frame.edge, *frame.low, *frame.high))
+        frames.add((*frame.origin, *frame.fine, frame.edge, *frame.low, *frame.high))
     assert len(frames) < 60
+
+
+def test_volume_space_stays_while_the_fine_volume_follows(plate):
+    """A step of the box costs what is its own, and nothing of what lies in volume space."""
+    moving = relighter(scene())
+    moving.render(plate)
+    moved = set()
+    for k in range(1, 12):
+        moment = scene((0.02 * k, 0.0, 0.0))
+        before = moving.plan
+        moving.set_scene(moment)
+        frame = moving.render(plate)
+        if moving.plan.fine != before.fine:
+            assert same(frame, relighter(moment).render(plate))
+        for name in ("origin", "scale", "coarse", "start"):
+            assert getattr(moving.plan, name) == getattr(before, name)
+        moved |= {name.split(", ")[-1] for name, reused in moving.stats["kept"].items() if not reused}
+    assert moved == {"fine volume"}
+
+
+def test_origins_are_near_objects_in_a_wide_scene():
+    """Coordinates on an object stay below five of its volume's edges, however far the real scene reaches."""
+    ground = lit.mesh(lit.rectangle((0.0, 0.0, 0.0), (0.0, 0.0, 500.0), (500.0, 0.0, 0.0)))
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        middle = np.array([*rng.uniform(-400.0, 400.0, 2), 0.2])[[0, 2, 1]]
+        frame = volume_frame(lit.scene_of(ground, lit.mesh(lit.cuboid(middle, 0.1), Role.SYNTHETIC)), 2.0)
+        assert np.abs(frame.middle).max() < 4.1
+        np.testing.assert_allclose(frame.origin + frame.middle * frame.edge, middle, atol=frame.edge / 16 + 1e-12)
 
 
 def test_objects_outside_of_the_real_scene_are_in_the_coarse_volume():

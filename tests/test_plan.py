@@ -52,8 +52,10 @@ def test_fine_volume_is_a_cube_around_the_objects():
     plan = plan_of(room(half=(0.1, 0.05, 0.02)))
     edge = 1 / plan.scale
     assert edge == pytest.approx(0.4, rel=0.0906), "steps of a quarter of an octave"
-    np.testing.assert_allclose(np.array(plan.origin) + 0.5 * edge, [0.5, 0.3, 0.5], atol=edge / 16)
-    assert (plan.fine.low, plan.fine.edge, plan.fine.n) == ((0.0, 0.0, 0.0), 1.0, 64)
+    middle = np.array(plan.origin) + (np.array(plan.fine.low) + 0.5) * edge
+    np.testing.assert_allclose(middle, [0.5, 0.3, 0.5], atol=edge / 16)
+    assert (plan.fine.edge, plan.fine.n) == (1.0, 64)
+    np.testing.assert_allclose(plan.origin, 0.5, atol=1e-12, err_msg="the middle of the room")
     assert plan.coarse is not None
     corners = (np.array([[0.05] * 3, [0.95] * 3]) - plan.origin) * plan.scale
     low = np.array(plan.coarse.low)
@@ -189,7 +191,7 @@ def test_texels_are_no_larger_than_voxels(source, shape):
     assert not entry.limited
     assert entry.shape == shape
     edge = 1 / plan.scale
-    center, radius = np.array(plan.origin) + 0.5 * edge, edge * np.sqrt(3) / 2
+    center, radius = np.array(plan.origin) + (np.array(plan.fine.low) + 0.5) * edge, edge * np.sqrt(3) / 2
     voxel = edge / 64
     if entry.shape == "orthographic":
         texel = np.pi * radius**2 / entry.size**2
@@ -240,7 +242,7 @@ def test_memory_of_the_volume_is_about_right(launcher, n):
     from warp_dvct.device_scene import DeviceScene
 
     device_scene = DeviceScene.upload(launcher, scene, np.array(plan.origin), plan.scale)
-    volume = lit.voxels_of(launcher, device_scene, n).volume
+    volume = lit.voxels_of(launcher, device_scene, n, plan.fine.low).volume
     held = volume.field.capacity + volume.cells.capacity + volume.tables.capacity
     said = next(p.bytes for p in plan.passes if p.name == "voxelize")
     assert 0.5 < said / held < 2

@@ -1,9 +1,10 @@
 """The frame of the volumes: where volume space lies in the world, in steps, so that small motions leave it as it is.
 
-What a moving shot keeps between frames (fragments of real triangles, hits of rays on them) is in volume space. If the
-fine volume followed every millimetre of an object, nothing could be kept; so its edge goes by steps of a quarter of an
-octave and its centre by eighths of its edge, both measured on the real scene, which does not move. A single frame makes
-the same choice as a frame of a shot, so both are equal bit for bit.
+What a moving shot keeps between frames (hits of rays on real triangles, fragments of these) is in volume space. If that
+followed every millimetre of an object, nothing could be kept. Its unit, the fine volume's edge, goes by steps of a
+quarter of an octave, measured on the real scene, which does not move; its origin is the middle of the real scene, or a
+point of a wide grid around it. In it the fine volume follows the objects in eighths of its edge, and takes with it only
+what is its own. A single frame makes the same choice as a frame of a shot, so both are equal bit for bit.
 """
 
 from __future__ import annotations
@@ -17,6 +18,9 @@ from warp_dvct.scene import Role, Scene
 
 STEPS_PER_OCTAVE = 4  # of the fine volume's edge: it is within 2**(1/8), 9 %, of what volume.scale asks for
 STEPS_PER_EDGE = 8  # of the fine volume's centre: it is within a sixteenth of the edge from the objects' middle
+# Of the fine volume, between two origins: it is never farther than half of that from the origin, which costs its
+# coordinates two bits of 24.
+EDGES_PER_ORIGIN = 8
 SPLIT_TO = 0.25  # of the coarse volume's half edge: triangles that cross its border are split until they are that small
 _UNIT = ([np.zeros(3)], [np.ones(3)])  # bounds of a scene without geometry
 ALMOST = 0.05  # of a step: objects may stand out of the real scene that far, less than the coarse volume's margin
@@ -27,15 +31,22 @@ class VolumeFrame:
     """Where the fine volume lies.
 
     Attributes:
-        origin: World position of its lowest corner, metres, float64 ``[3]``.
-        edge: Its edge in metres.
+        origin: World position of volume space's origin, metres, float64 ``[3]``.
+        edge: Its unit, the fine volume's edge, in metres.
+        fine: Lowest corner of the fine volume, in volume space.
         low, high: Bounds of the whole scene in volume space. They too move in steps of the objects.
     """
 
     origin: np.ndarray
     edge: float
+    fine: np.ndarray
     low: np.ndarray
     high: np.ndarray
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Of the fine volume, in volume space."""
+        return self.fine + 0.5
 
 
 def volume_frame(scene: Scene, volume_scale: float) -> VolumeFrame:
@@ -43,7 +54,7 @@ def volume_frame(scene: Scene, volume_scale: float) -> VolumeFrame:
 
     Its edge is the step nearest to ``volume_scale`` times the largest edge of the synthetic objects' bounding box, and
     never so small that the box is not inside. Without real or without synthetic geometry nothing can be kept, and the
-    volume is exactly that large and centred.
+    volume is exactly that large and centred, its corner the origin.
     """
     synthetic, real = scene.bounds(Role.SYNTHETIC), scene.bounds(Role.REAL)
     lows, highs = zip(*(b for b in (synthetic, real) if b is not None), strict=True) if synthetic or real else _UNIT
@@ -55,20 +66,26 @@ def volume_frame(scene: Scene, volume_scale: float) -> VolumeFrame:
     unit = float(np.max(real[1] - real[0])) if real is not None else 0.0
     if synthetic is None or real is None or unit <= 0.0:
         origin = center - 0.5 * edge
-        return VolumeFrame(origin, edge, (everything[0] - origin) / edge, (everything[1] - origin) / edge)
+        return VolumeFrame(origin, edge, np.zeros(3), (everything[0] - origin) / edge, (everything[1] - origin) / edge)
     step = round(STEPS_PER_OCTAVE * math.log2(edge / unit))
     while unit * 2.0 ** (step / STEPS_PER_OCTAVE) * (1.0 - 1.0 / STEPS_PER_EDGE) < size:
         step += 1
     edge = unit * 2.0 ** (step / STEPS_PER_OCTAVE)
+    middle = 0.5 * (real[0] + real[1])
+    origin = middle + np.round((center - middle) / (EDGES_PER_ORIGIN * edge)) * (EDGES_PER_ORIGIN * edge)
     grid = edge / STEPS_PER_EDGE
-    origin = real[0] + np.round((center - real[0]) / grid) * grid - 0.5 * edge
-    outer = np.floor((low - origin) / grid) / STEPS_PER_EDGE, np.ceil((high - origin) / grid) / STEPS_PER_EDGE
     inner = (real[0] - origin) / edge, (real[1] - origin) / edge
+    fine = inner[0] + np.round((center - real[0]) / grid) / STEPS_PER_EDGE - 0.5
+    outer = tuple(
+        inner[0] + toward((bound - real[0]) / grid) / STEPS_PER_EDGE
+        for toward, bound in ((np.floor, low), (np.ceil, high))
+    )
     # Where the objects are inside of the real scene's bounds, or all but inside, their motion does not show at all.
     slack = ALMOST * grid
     return VolumeFrame(
         origin,
         edge,
+        fine,
         np.where(low < real[0] - slack, np.minimum(inner[0], outer[0]), inner[0]),
         np.where(high > real[1] + slack, np.maximum(inner[1], outer[1]), inner[1]),
     )

@@ -57,7 +57,7 @@ class MapPlan:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a method will do. Boxes are in volume space, in which the fine volume is the unit cube.
+    """What a method will do. Boxes are in volume space, whose unit is the fine volume's edge.
 
     Attributes:
         origin, scale: Volume space is ``(world - origin) * scale``, metres.
@@ -126,8 +126,8 @@ def make_plan(
     frame = volume_frame(scene, settings.volume_scale)
     origin, scale = frame.origin, 1.0 / frame.edge
     coarse = _coarse_box(scene, frame, settings)
-    reach = float(np.linalg.norm(np.max(np.abs(np.stack([frame.low, frame.high]) - 0.5), 0)))
-    fine = Box((0.0, 0.0, 0.0), 1.0, settings.volume_resolution)
+    across = float(np.linalg.norm(frame.high - frame.low))
+    fine = Box(_corner(frame.fine), 1.0, settings.volume_resolution)
     maps = tuple(_plan_map(i, x, origin, scale, fine, coarse, synthetic, settings) for i, x in enumerate(scene.lights))
     glossy = _is_glossy(scene, settings)
     changes = synthetic is not None or added
@@ -149,11 +149,11 @@ def make_plan(
         settings,
         width,
         height,
-        (float(origin[0]), float(origin[1]), float(origin[2])),
+        _corner(origin),
         scale,
         fine,
         coarse,
-        min(reach + 1.0, 1e4),
+        min(across + 1.0, 1e4),
         maps,
         glossy,
         changes,
@@ -177,19 +177,21 @@ def _coarse_box(scene: Scene, frame: VolumeFrame, settings: Settings) -> Box | N
     What is left out reflects nothing. Of an open ground that is a line at the horizon; of the room around a small
     object it would be all its walls: as long as too much is left out, the reach is doubled.
     """
-    low, high = frame.low, frame.high
-    if settings.volume_coarse == 0 or (np.all(low >= 0.0) and np.all(high <= 1.0)):
+    low, high, middle = frame.low, frame.high, frame.middle
+    if settings.volume_coarse == 0 or (np.all(low >= frame.fine) and np.all(high <= frame.fine + 1.0)):
         return None
     half = 0.5 * settings.volume_reach
-    middle = frame.origin + 0.5 * frame.edge
-    while (np.any(low < 0.5 - half) or np.any(high > 0.5 + half)) and (
-        share_beyond(scene, middle, half * frame.edge) > MOST_BEYOND
+    while (np.any(low < middle - half) or np.any(high > middle + half)) and (
+        share_beyond(scene, frame.origin + middle * frame.edge, half * frame.edge) > MOST_BEYOND
     ):
         half *= 2.0
-    low, high = np.maximum(low, 0.5 - half), np.minimum(high, 0.5 + half)
+    low, high = np.maximum(low, middle - half), np.minimum(high, middle + half)
     edge = COARSE_MARGIN * max(float(np.max(high - low)), 1.0)
-    corner = 0.5 * (low + high) - 0.5 * edge
-    return Box((float(corner[0]), float(corner[1]), float(corner[2])), edge, settings.volume_coarse)
+    return Box(_corner(0.5 * (low + high) - 0.5 * edge), edge, settings.volume_coarse)
+
+
+def _corner(point: np.ndarray) -> tuple[float, float, float]:
+    return float(point[0]), float(point[1]), float(point[2])
 
 
 def _plan_map(
