@@ -30,6 +30,10 @@ class Geometry:
     body_center: wp.array(dtype=wp.vec3)  # middle of the box around each
     body_extent: wp.array(dtype=wp.vec3)  # half its edges
     body_middle: wp.array(dtype=wp.vec3)  # mean of its vertices
+    blockers: wp.uint64  # real triangles that can lie between two points of the scene, or between one and a light
+    has_blockers: int
+    blockers_center: wp.vec3  # middle of a box that holds them
+    blockers_extent: wp.vec3  # half its edges
     hull: wp.array(dtype=int)  # [synthetic triangles], the body on whose convex hull a triangle lies, or -1
     corner_normals: wp.array(dtype=wp.vec3)  # zero where the triangle is faceted
     corner_uvs: wp.array(dtype=wp.vec2)
@@ -187,6 +191,16 @@ def occluded_by_real(geo: Geometry, origin: wp.vec3, direction: wp.vec3, t_max: 
     if geo.has_real == 0:
         return False
     return wp.mesh_query_ray_anyhit(geo.real, origin, direction, t_max)
+
+
+@wp.func
+def blocked_by_real(geo: Geometry, origin: wp.vec3, direction: wp.vec3, t_max: float) -> bool:
+    """As ``occluded_by_real`` for a ray from a surface that ends at a light, or goes on to a parallel one."""
+    if geo.has_blockers == 0:
+        return False
+    if not meets_box(geo.blockers_center, geo.blockers_extent, origin, direction, t_max):
+        return False
+    return wp.mesh_query_ray_anyhit(geo.blockers, origin, direction, t_max)
 
 
 @wp.func

@@ -8,7 +8,14 @@ import warp as wp
 
 from warp_dvct.kernels.bounce_field import BounceField, bounced_irradiance
 from warp_dvct.kernels.environment import Environment, environment_radiance
-from warp_dvct.kernels.geometry import FAR, Geometry, Hit, corner_position
+from warp_dvct.kernels.geometry import (
+    FAR,
+    Geometry,
+    Hit,
+    corner_position,
+    occluded_by_real,
+    occluded_by_synthetic,
+)
 from warp_dvct.kernels.lights import ADDED, DOME, Lights, light_along_ray, sample_light
 from warp_dvct.kernels.materials import (
     Materials,
@@ -60,14 +67,14 @@ def domes_in_lobe(geo: Geometry, env: Environment, s: Surface, wo: wp.vec3) -> S
     sent = Sent()
     direction = wp.normalize(s.normal * (2.0 * wp.dot(s.normal, wo)) - wo)
     if env.levels > 0 and wp.dot(direction, s.normal_g) > 0.0:
-        sight = look(geo, spawn_point(s, direction), direction, FAR, True, True)
-        # Directions spread by twice the normals' slope.
-        solid_angle = PI * 4.0 * s.alpha * s.alpha
-        weight = fresnel(s.f0, s.f90, wp.dot(s.normal, wo))
-        if sight.before > 0.0:
+        origin = spawn_point(s, direction)
+        if not occluded_by_real(geo, origin, direction, FAR):
+            # Directions spread by twice the normals' slope.
+            solid_angle = PI * 4.0 * s.alpha * s.alpha
+            weight = fresnel(s.f0, s.f90, wp.dot(s.normal, wo))
             sent.before = wp.cw_mul(weight, environment_radiance(env, direction, solid_angle, 0))
-        if sight.after > 0.0:
-            sent.after = wp.cw_mul(weight, environment_radiance(env, direction, solid_angle, 1))
+            if not occluded_by_synthetic(geo, origin, direction, FAR):
+                sent.after = wp.cw_mul(weight, environment_radiance(env, direction, solid_angle, 1))
     return sent
 
 
@@ -103,7 +110,7 @@ def lights_in_lobe(
                 f *= power_share(light.pdf, vndf_pdf(s, wo, light.direction))
             if wp.max(f[0], wp.max(f[1], f[2])) > faint:
                 reach = light.distance * SHADOW_END
-                sight = look(geo, spawn_point(s, light.direction), light.direction, reach, real_before, True)
+                sight = look(geo, spawn_point(s, light.direction), light.direction, reach, real_before, True, True)
                 sent.after += f * sight.after
                 if real_before:
                     sent.before += f * sight.before
@@ -112,7 +119,7 @@ def lights_in_lobe(
             if met.pdf > 0.0:
                 f = wp.cw_mul(bounce_weight, met.radiance) * power_share(bounce_density, met.pdf)
                 if wp.max(f[0], wp.max(f[1], f[2])) > faint:
-                    sight = look(geo, origin, bounce, met.distance * SHADOW_END, real_before, True)
+                    sight = look(geo, origin, bounce, met.distance * SHADOW_END, real_before, True, True)
                     sent.after += f * sight.after
                     if real_before:
                         sent.before += f * sight.before

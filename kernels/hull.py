@@ -18,9 +18,11 @@ IN_LARGE = wp.constant(8)  # small boxes in a large one
 
 @wp.struct
 class Bodies:
-    """The vertices of the synthetic objects, in boxes of boxes of neighbours; a body's follow one another."""
+    """The vertices of objects, in boxes of boxes of neighbours; a body's follow one another."""
 
-    of_triangle: wp.array(dtype=wp.int32)  # [synthetic triangles], NO_BODY where not to ask
+    first_triangle: wp.int32
+    of_triangle: wp.array(dtype=wp.int32)  # [triangles from the first on], NO_BODY where not to ask
+    middle: wp.array(dtype=wp.vec3)  # [bodies], mean of its vertices
     first: wp.array(dtype=wp.int32)  # [bodies + 1], large boxes
     center: wp.array(dtype=wp.vec3)  # [small boxes], their middles
     extent: wp.array(dtype=wp.vec3)  # [small boxes], half their edges
@@ -31,7 +33,7 @@ class Bodies:
 
 @wp.kernel
 def _mark_hull(first: int, geo: Geometry, bodies: Bodies, hull_out: wp.array(dtype=wp.int32)):
-    """The body of each synthetic triangle that lies on its convex hull, else NO_BODY.
+    """The body of each triangle that lies on its convex hull, else NO_BODY.
 
     Its plane is that of ``materials.surface_at``, and vertices count as below where they are by half of the step that
     ``materials.spawn_point`` takes: a ray that begins there and goes outwards stays above all of them.
@@ -41,13 +43,13 @@ def _mark_hull(first: int, geo: Geometry, bodies: Bodies, hull_out: wp.array(dty
     hull_out[i] = NO_BODY
     if body == NO_BODY:
         return
-    p = corner_position(geo, geo.synthetic_first + i, 0)
-    q = corner_position(geo, geo.synthetic_first + i, 1)
-    r = corner_position(geo, geo.synthetic_first + i, 2)
+    p = corner_position(geo, bodies.first_triangle + i, 0)
+    q = corner_position(geo, bodies.first_triangle + i, 1)
+    r = corner_position(geo, bodies.first_triangle + i, 2)
     normal = wp.normalize(wp.cross(q - p, r - p))
     if wp.length_sq(normal) == 0.0:
         return
-    if wp.dot(normal, geo.body_middle[body] - p) > 0.0:
+    if wp.dot(normal, bodies.middle[body] - p) > 0.0:
         normal = -normal
     reach = wp.max(largest_coordinate(p), wp.max(largest_coordinate(q), largest_coordinate(r)))
     lowest = wp.min(0.0, wp.min(wp.dot(normal, q - p), wp.dot(normal, r - p)))

@@ -13,7 +13,7 @@ from warp_dvct.kernels.gbuffer import (
     load_surface,
     share_of,
 )
-from warp_dvct.kernels.geometry import Geometry, occluded_by_real, occluded_by_synthetic
+from warp_dvct.kernels.geometry import Geometry, blocked_by_real, occluded_by_synthetic
 from warp_dvct.kernels.hull import body_left, clear_of_objects
 from warp_dvct.kernels.lights import ADDED, DISK, DISTANT, DOME, RECT, Lights, LightSample, sample_light
 from warp_dvct.kernels.materials import (
@@ -106,13 +106,13 @@ def beyond_sides(lights: Lights, i: int, to_light: wp.vec3, toward: wp.vec3, ext
 
 
 @wp.func
-def may_shadow(geo: Geometry, lights: Lights, i: int, position: wp.vec3) -> bool:
-    """Whether the box around the synthetic objects may meet a segment from a point to a light.
+def box_may_shadow(center: wp.vec3, extent: wp.vec3, lights: Lights, i: int, position: wp.vec3) -> bool:
+    """Whether a box may meet a segment from a point to a light.
 
     False only where a plane parts the box from the hull of point and light: one across the way to the box, a side of
     the pyramid over a planar light, or a face of the box.
     """
-    toward = geo.center - position
+    toward = center - position
     axis = -lights.direction[i]
     sine2 = lights.cap[i] * (2.0 - lights.cap[i])
     if lights.kind[i] != DISTANT:
@@ -124,14 +124,14 @@ def may_shadow(geo: Geometry, lights: Lights, i: int, position: wp.vec3) -> bool
             return True
         size = size + wp.vec3(lights.radius[i], lights.radius[i], lights.radius[i])
         gap = wp.max(wp.vec3(0.0, 0.0, 0.0), to_light + size)
-        room = geo.extent + BOX_MARGIN * (wp.abs(toward) + wp.abs(to_light) + size + geo.extent)
+        room = extent + BOX_MARGIN * (wp.abs(toward) + wp.abs(to_light) + size + extent)
         if toward[0] - room[0] > gap[0] or toward[1] - room[1] > gap[1] or toward[2] - room[2] > gap[2]:
             return False
         gap = wp.min(wp.vec3(0.0, 0.0, 0.0), to_light - size)
         if toward[0] + room[0] < gap[0] or toward[1] + room[1] < gap[1] or toward[2] + room[2] < gap[2]:
             return False
         if lights.kind[i] == RECT or lights.kind[i] == DISK:
-            if beyond_sides(lights, i, to_light, toward, geo.extent):
+            if beyond_sides(lights, i, to_light, toward, extent):
                 return False
         axis = to_light / wp.sqrt(far2)
         sine2 = bound * bound / far2
@@ -143,7 +143,21 @@ def may_shadow(geo: Geometry, lights: Lights, i: int, position: wp.vec3) -> bool
     if wp.length_sq(across) <= ON_AXIS * wp.length_sq(toward):
         return True
     across = wp.normalize(across)
-    return not beyond(across * wp.sqrt(1.0 - sine2) - axis * wp.sqrt(sine2), toward, geo.extent)
+    return not beyond(across * wp.sqrt(1.0 - sine2) - axis * wp.sqrt(sine2), toward, extent)
+
+
+@wp.func
+def may_shadow(geo: Geometry, lights: Lights, i: int, position: wp.vec3) -> bool:
+    """Whether synthetic objects may lie between a point and a light, by the box around them."""
+    return box_may_shadow(geo.center, geo.extent, lights, i, position)
+
+
+@wp.func
+def may_be_hidden(geo: Geometry, lights: Lights, i: int, position: wp.vec3) -> bool:
+    """Whether real surfaces may lie between a point on a surface and a light, by the box around the blockers."""
+    if geo.has_blockers == 0:
+        return False
+    return box_may_shadow(geo.blockers_center, geo.blockers_extent, lights, i, position)
 
 
 @wp.func
@@ -172,14 +186,17 @@ class Sight:
 
 
 @wp.func
-def look(geo: Geometry, origin: wp.vec3, direction: wp.vec3, reach: float, before: bool, shadowed: bool) -> Sight:
-    """Trace a shadow ray. ``before`` is as ``after`` unless asked for: what objects hide then needs no second ray."""
+def look(
+    geo: Geometry, origin: wp.vec3, direction: wp.vec3, reach: float, before: bool, shadowed: bool, hides: bool
+) -> Sight:
+    """Trace a shadow ray to a light. ``before`` is as ``after`` unless asked for: what objects hide then needs no
+    second ray. ``shadowed``, ``hides``: Whether objects, and real surfaces, may be in the way."""
     blocked = bool(False)
     if shadowed:
         blocked = occluded_by_synthetic(geo, origin, direction, reach)
     hidden = bool(False)
-    if before or not blocked:
-        hidden = occluded_by_real(geo, origin, direction, reach)
+    if hides and (before or not blocked):
+        hidden = blocked_by_real(geo, origin, direction, reach)
     sight = Sight()
     sight.after = wp.where(blocked or hidden, 0.0, 1.0)
     sight.before = sight.after
@@ -236,6 +253,7 @@ def light_taken(s: Surface, wo: wp.vec3, draw: Draw, geo: Geometry, lights: Ligh
     are not traced.
     """
     taken = wp.vec3(0.0, 0.0, 0.0)
+    hides = may_be_hidden(geo, lights, k, s.position)
     lit = bool(False)
     passed = int(0)
     blocked = int(0)
@@ -259,8 +277,8 @@ def light_taken(s: Surface, wo: wp.vec3, draw: Draw, geo: Geometry, lights: Ligh
                 if meets:
                     blocked += 1
                     hidden = bool(False)
-                    if tracing:
-                        hidden = occluded_by_real(geo, origin, light.direction, reach)
+                    if tracing and hides:
+                        hidden = blocked_by_real(geo, origin, light.direction, reach)
                     if not hidden:
                         seen += 1
                         taken += f
@@ -296,6 +314,7 @@ def light_part(
     seen_after = float(0.0)
     traced = int(0)
     body = body_left(geo, s)
+    hides = may_be_hidden(geo, lights, k, s.position)
     samples = int(draw.samples)
     tracing = bool(True)
     count = int(0)
@@ -307,7 +326,7 @@ def light_part(
             origin = spawn_point(s, light.direction)
             reach = light.distance * SHADOW_END
             meets = shadowed and not clear_of_objects(geo, body, s.normal_g, origin, light.direction, reach)
-            sight = look(geo, origin, light.direction, reach, both, meets)
+            sight = look(geo, origin, light.direction, reach, both, meets, hides)
             sum_before += f * sight.before
             sum_after += f * sight.after
             seen_before += sight.before

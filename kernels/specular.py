@@ -11,6 +11,7 @@ from warp_dvct.kernels.gbuffer import BACKGROUND, UNSEEN, Points, first_sample, 
 from warp_dvct.kernels.geometry import (
     FAR,
     Geometry,
+    blocked_by_real,
     occluded_by_real,
     occluded_by_synthetic,
     trace_real,
@@ -86,7 +87,12 @@ def lit_by_lights(
         if wp.max(f[0], wp.max(f[1], f[2])) > 0.0:
             origin = spawn_point(s, light.direction)
             reach = light.distance * SHADOW_END
-            if not occluded_by_real(geo, origin, light.direction, reach):
+            hidden = bool(False)
+            if lights.kind[k] == DOME:
+                hidden = occluded_by_real(geo, origin, light.direction, reach)
+            else:
+                hidden = blocked_by_real(geo, origin, light.direction, reach)
+            if not hidden:
                 if with_before != 0 and lights.role[k] != ADDED:
                     result.before += f
                 if not occluded_by_synthetic(geo, origin, light.direction, reach):

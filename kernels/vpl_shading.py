@@ -299,7 +299,7 @@ def lit_surface(
             f = wp.cw_mul(brdf_cos_diffuse(s, wo, light.direction), light.value)
             if wp.max(f[0], wp.max(f[1], f[2])) > 0.0:
                 origin = spawn_point(s, light.direction)
-                seen = look(geo, origin, light.direction, light.distance * SHADOW_END, want_before != 0, True)
+                seen = look(geo, origin, light.direction, light.distance * SHADOW_END, want_before != 0, True, True)
                 if lights.role[k] != ADDED:
                     out.before += f * seen.before
                 out.after += f * seen.after

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_dvct.blockers import RealHull
 from warp_dvct.boxes import around_runs, middle_and_half
 from warp_dvct.errors import StageError
 from warp_dvct.kept import Kept
@@ -20,7 +21,7 @@ from warp_dvct.kernels.geometry import FAR, CameraFrame, Geometry
 from warp_dvct.kernels.lights import Lights
 from warp_dvct.kernels.materials import Materials
 from warp_dvct.launch import Launcher
-from warp_dvct.passes.hull import mark_hulls
+from warp_dvct.passes.hull import mark_hulls, real_hull
 from warp_dvct.passes.sidedness import lit_from_behind
 from warp_dvct.scene import Camera, Light, LightKind, Material, Mesh, Role, Scene, Texture
 from warp_dvct.targets import targets_of
@@ -38,6 +39,7 @@ class DeviceScene:
     Attributes:
         geometry, materials, lights, camera: Kernel structs, in volume space.
         real, synthetic: The acceleration structures (``wp.Mesh``); None where there are no such triangles.
+        blockers: That of the real triangles which can lie between a surface and a light (:mod:`warp_dvct.blockers`).
         targets: Where the synthetic triangles are (``kernels.aim.Targets``), see :func:`warp_dvct.targets.targets_of`.
         triangles_vs: Host float32 ``[t, 3, 3]``, corners in volume space; real triangles first, then synthetic ones.
         role, material: Host int32 ``[t]``.
@@ -54,6 +56,7 @@ class DeviceScene:
     camera: Any
     real: Any
     synthetic: Any
+    blockers: Any
     targets: Any
     triangles_vs: np.ndarray
     role: np.ndarray
@@ -91,7 +94,15 @@ class DeviceScene:
         synthetic = building()
         boxes = host.boxes(first)
         geometry = _upload_geometry(launcher, host, real, synthetic, boxes)
-        mark_hulls(launcher, geometry, boxes, host.synthetic_vertices, host.synthetic_counts)
+        mark_hulls(launcher, geometry, boxes, host.vertices[host.first :], host.counts[host.first :])
+        hull = kept.get("real hull", None, lambda: _real_hull(launcher, host, geometry))
+        blocking = hull.blocking(boxes, scene.lights, origin, scale)
+        blockers = kept.get(
+            "blockers",
+            blocking.tobytes(),
+            lambda: real if blocking.all() else _mesh(*_mesh_arrays(launcher, host.triangles[:first][blocking])),
+        )
+        _set_blockers(geometry, blockers, host.triangles[:first][blocking])
         double_sided = _both_sides(launcher, host, geometry, materials, lights)
         geometry.double_sided = launcher.array(double_sided, wp.int32)
         return DeviceScene(
@@ -101,6 +112,7 @@ class DeviceScene:
             camera=camera_frame(scene.camera, origin, scale),
             real=real,
             synthetic=synthetic,
+            blockers=blockers,
             targets=targets_of(boxes),
             triangles_vs=host.triangles,
             role=host.role,
@@ -129,8 +141,9 @@ class _HostTriangles:
     mesh: np.ndarray
     scanned: np.ndarray
     synthetic_first: int
-    synthetic_vertices: list[np.ndarray]
-    synthetic_counts: list[int]
+    first: int  # synthetic mesh
+    vertices: list[np.ndarray]  # of each mesh
+    counts: list[int]  # of its triangles
 
     def boxes(self, first: int = 0) -> np.ndarray:
         """Low and high corners of each mesh from triangle ``first`` on, ``[m, 2, 3]``."""
@@ -143,7 +156,6 @@ class _HostTriangles:
         """All triangles, real meshes first; absent normals become 0 (faceted), uvs 0 and colours 1."""
         meshes = sorted((m for m in scene.meshes if len(m.triangles)), key=lambda m: int(m.role))
         counts = [len(m.triangles) for m in meshes]
-        first = sum(m.role == Role.REAL for m in meshes)
         vertices = [((m.points - origin) * scale).astype(np.float32) for m in meshes]
 
         def corners(values, width: int, absent: float) -> np.ndarray:
@@ -166,9 +178,10 @@ class _HostTriangles:
             role=each([np.full(n, m.role) for m, n in zip(meshes, counts, strict=True)]),
             mesh=each([np.full(n, i) for i, n in enumerate(counts)]),
             scanned=each([np.full(n, m.scanned) for m, n in zip(meshes, counts, strict=True)]),
-            synthetic_first=sum(counts[:first]),
-            synthetic_vertices=vertices[first:],
-            synthetic_counts=counts[first:],
+            synthetic_first=sum(n for m, n in zip(meshes, counts, strict=True) if m.role == Role.REAL),
+            first=sum(m.role == Role.REAL for m in meshes),
+            vertices=vertices,
+            counts=counts,
         )
 
 
@@ -233,6 +246,20 @@ def _upload_geometry(launcher: Launcher, host: _HostTriangles, real: Any, synthe
     geometry.material = launcher.array(host.material, wp.int32)
     geometry.double_sided = launcher.array(host.double_sided, wp.int32)
     return geometry
+
+
+def _real_hull(launcher: Launcher, host: _HostTriangles, geometry: Any) -> RealHull:
+    index = real_hull(launcher, geometry, host.vertices[: host.first], host.synthetic_first)
+    return RealHull.of(host.triangles[: host.synthetic_first], index)
+
+
+def _set_blockers(geometry: Any, blockers: Any, triangles: np.ndarray) -> None:
+    geometry.has_blockers = int(blockers is not None)
+    geometry.blockers = wp.uint64(blockers.id if blockers is not None else 0)
+    if blockers is not None:
+        box = around_runs(triangles.reshape(-1, 3), np.zeros(1, np.int64))
+        center, extent = middle_and_half(box)
+        geometry.blockers_center, geometry.blockers_extent = wp.vec3(*center[0]), wp.vec3(*extent[0])
 
 
 def _material_f0(material: Material) -> tuple[float, float, float]:

@@ -14,6 +14,7 @@ from warp_dvct.launch import Launcher
 
 MOST_BODIES = 8  # objects with a box of their own, which rays are tested against one after the other
 MOST_TRIANGLES = 2**16  # of a body: all of its vertices are looked at for each, which takes longer than it saves then
+MOST_REAL_TRIANGLES = 2**14  # rooms that were modelled; of scans hardly a triangle is on the hull
 CELLS = 32  # an edge of the grid by which vertices are grouped
 
 
@@ -30,27 +31,42 @@ def mark_hulls(
     if len(counts) > MOST_BODIES:
         boxes = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])[None]
         vertices, counts = [np.concatenate(vertices)], [sum(counts)]
-    triangles = sum(counts)
     center, extent = middle_and_half(boxes)
-    middle = np.array([v.mean(0, dtype=np.float64) for v in vertices], np.float32).reshape(-1, 3)
     geometry.bodies = len(counts)
     geometry.body_center = launcher.array(center, wp.vec3)
     geometry.body_extent = launcher.array(extent, wp.vec3)
-    geometry.body_middle = launcher.array(middle, wp.vec3)
-    geometry.hull = launcher.empty(triangles, wp.int32)
-    asked = np.array([k if n <= MOST_TRIANGLES else kernels.NO_BODY for k, n in enumerate(counts)], np.int32)
-    bodies = _grouped(launcher, vertices)
-    bodies.of_triangle = launcher.array(np.repeat(asked, counts), wp.int32)
-    launcher.launch(kernels._mark_hull, triangles, [geometry, bodies], [geometry.hull])
+    bodies = _bodies(launcher, vertices, counts)
+    bodies.first_triangle = geometry.synthetic_first
+    geometry.body_middle = bodies.middle
+    geometry.hull = hull_marks(launcher, geometry, bodies, sum(counts))
 
 
-def _grouped(launcher: Launcher, vertices: Sequence[np.ndarray]) -> Any:
-    """``Bodies`` without their triangles."""
+def real_hull(launcher: Launcher, geometry: Any, vertices: Sequence[np.ndarray], count: int) -> np.ndarray:
+    """Indices of the ``count`` real triangles that lie on the convex hull of them all; none where they are many."""
+    if not 0 < count <= MOST_REAL_TRIANGLES:
+        return np.zeros(0, np.int64)
+    bodies = _bodies(launcher, [np.concatenate(vertices)], [count])
+    return np.flatnonzero(hull_marks(launcher, geometry, bodies, count).numpy() != kernels.NO_BODY)
+
+
+def hull_marks(launcher: Launcher, geometry: Any, bodies: Any, count: int) -> Any:
+    """Per triangle of ``bodies``, int ``[count]``: the body on whose hull it lies, or ``kernels.NO_BODY``."""
+    marks = launcher.empty(count, wp.int32)
+    launcher.launch(kernels._mark_hull, count, [geometry, bodies], [marks])
+    return marks
+
+
+def _bodies(launcher: Launcher, vertices: Sequence[np.ndarray], counts: Sequence[int]) -> Any:
+    """``Bodies`` of objects by their vertices, float32 ``[v, 3]`` each, and their numbers of triangles."""
     small, large = int(kernels.SMALL), int(kernels.SMALL * kernels.IN_LARGE)
     # The last vertex fills a body's last boxes.
     blocks = [np.pad(v[_along_z_curve(v)], ((0, -len(v) % large), (0, 0)), "edge") for v in vertices]
     ordered = np.concatenate([np.zeros((0, 3), np.float32), *blocks])
+    asked = np.array([k if n <= MOST_TRIANGLES else kernels.NO_BODY for k, n in enumerate(counts)], np.int32)
+    middle = np.array([v.mean(0, dtype=np.float64) for v in vertices], np.float32).reshape(-1, 3)
     bodies = kernels.Bodies()
+    bodies.of_triangle = launcher.array(np.repeat(asked, counts), wp.int32)
+    bodies.middle = launcher.array(middle, wp.vec3)
     bodies.first = launcher.array(np.cumsum([0, *(len(b) // large for b in blocks)]).astype(np.int32), wp.int32)
     bodies.vertex = launcher.array(ordered, wp.vec3)
     center, extent = middle_and_half(around_runs(ordered, np.arange(0, len(ordered), small)))
