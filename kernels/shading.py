@@ -393,7 +393,7 @@ def _shade_direct(
     for k in range(lights.count):
         if lights.kind[k] != DOME and not unlit(lights, k, s.position, s.normal_g):
             added = lights.role[k] == ADDED
-            shadowed = may_shadow(geo, lights, k, s.position)
+            shadowed = role == SYNTHETIC or may_shadow(geo, lights, k, s.position)
             whole = role == SYNTHETIC or added
             if whole or direct.with_before != 0:
                 part = light_part(draw, s, wo, geo, lights, k, direct, not whole, shadowed)
