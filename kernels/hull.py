@@ -6,7 +6,7 @@ of all the boxes that hold their own triangle.
 
 import warp as wp
 
-from warp_dvct.kernels.geometry import OFFSET_RELATIVE, Geometry, corner_position, largest_coordinate, meets_box
+from warp_dvct.kernels.geometry import OFFSET_RELATIVE, Geometry, largest_coordinate, meets_box
 from warp_dvct.kernels.materials import Surface
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -20,8 +20,7 @@ IN_LARGE = wp.constant(8)  # small boxes in a large one
 class Bodies:
     """The vertices of objects, in boxes of boxes of neighbours; a body's follow one another."""
 
-    first_triangle: wp.int32
-    of_triangle: wp.array(dtype=wp.int32)  # [triangles from the first on], NO_BODY where not to ask
+    of_triangle: wp.array(dtype=wp.int32)  # [triangles], NO_BODY where not to ask
     middle: wp.array(dtype=wp.vec3)  # [bodies], mean of its vertices
     first: wp.array(dtype=wp.int32)  # [bodies + 1], large boxes
     center: wp.array(dtype=wp.vec3)  # [small boxes], their middles
@@ -32,7 +31,7 @@ class Bodies:
 
 
 @wp.kernel
-def _mark_hull(first: int, geo: Geometry, bodies: Bodies, hull_out: wp.array(dtype=wp.int32)):
+def _mark_hull(first: int, corner_in: wp.array(dtype=wp.vec3), bodies: Bodies, hull_out: wp.array(dtype=wp.int32)):
     """The body of each triangle that lies on its convex hull, else NO_BODY.
 
     Its plane is that of ``materials.surface_at``, and vertices count as below where they are by half of the step that
@@ -43,9 +42,9 @@ def _mark_hull(first: int, geo: Geometry, bodies: Bodies, hull_out: wp.array(dty
     hull_out[i] = NO_BODY
     if body == NO_BODY:
         return
-    p = corner_position(geo, bodies.first_triangle + i, 0)
-    q = corner_position(geo, bodies.first_triangle + i, 1)
-    r = corner_position(geo, bodies.first_triangle + i, 2)
+    p = corner_in[3 * i]
+    q = corner_in[3 * i + 1]
+    r = corner_in[3 * i + 2]
     normal = wp.normalize(wp.cross(q - p, r - p))
     if wp.length_sq(normal) == 0.0:
         return

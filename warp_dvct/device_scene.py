@@ -16,7 +16,7 @@ import warp as wp
 from warp_dvct.blockers import RealHull
 from warp_dvct.boxes import around_runs, middle_and_half
 from warp_dvct.errors import StageError
-from warp_dvct.kept import Kept
+from warp_dvct.kept import Kept, content_key
 from warp_dvct.kernels.geometry import FAR, CameraFrame, Geometry
 from warp_dvct.kernels.lights import Lights
 from warp_dvct.kernels.materials import Materials
@@ -86,16 +86,19 @@ class DeviceScene:
         _check_indices(scene)
         host = _HostTriangles.gather(scene, origin, scale)
         kept = kept or Kept()
-        building = _begin_mesh(launcher, host.triangles[host.synthetic_first :])
         first = host.synthetic_first
-        real = kept.get("real triangles", None, lambda: _mesh(*_mesh_arrays(launcher, host.triangles[:first])))
-        materials = _upload_materials(launcher, scene.materials, scene.textures)
-        lights = upload_lights(launcher, scene.lights, origin, scale)
-        synthetic = building()
         boxes = host.boxes(first)
+        corners, building = _begin_mesh(launcher, host.triangles[first:])
+        # Beside the tree's building: nothing here asks it.
+        materials = kept.get("materials", None, lambda: _upload_materials(launcher, scene.materials, scene.textures))
+        lights = kept.get(
+            "lights", content_key(scene.lights), lambda: upload_lights(launcher, scene.lights, origin, scale)
+        )
+        hulls = mark_hulls(launcher, corners, boxes, host.vertices[host.first :], host.counts[host.first :])
+        real, hull = kept.get("real triangles", None, lambda: _real(launcher, host))
+        synthetic = building()
         geometry = _upload_geometry(launcher, host, real, synthetic, boxes)
-        mark_hulls(launcher, geometry, boxes, host.vertices[host.first :], host.counts[host.first :])
-        hull = kept.get("real hull", None, lambda: _real_hull(launcher, host, geometry))
+        hulls.set(geometry)
         blocking = hull.blocking(boxes, scene.lights, origin, scale)
         blockers = kept.get(
             "blockers",
@@ -202,10 +205,18 @@ def _check_range(mesh: Mesh, what: str, indices: np.ndarray, count: int) -> None
         )
 
 
-def _begin_mesh(launcher: Launcher, triangles: np.ndarray) -> Callable[[], Any]:
-    """Triangles with their tree, which a thread of its own builds; the result waits for it."""
+def _begin_mesh(launcher: Launcher, triangles: np.ndarray) -> tuple[Any, Callable[[], Any]]:
+    """Corners of triangles, and those with their tree, which a thread of its own builds: the call waits for it."""
     arrays = _mesh_arrays(launcher, triangles)
-    return launcher.apart(lambda: _mesh(*arrays))
+    return arrays[0], launcher.apart(lambda: _mesh(*arrays))
+
+
+def _real(launcher: Launcher, host: _HostTriangles) -> tuple[Any, RealHull]:
+    """The real triangles with their tree, and which of them are on their hull."""
+    triangles = host.triangles[: host.synthetic_first]
+    arrays = _mesh_arrays(launcher, triangles)
+    index = real_hull(launcher, arrays[0], host.vertices[: host.first], host.synthetic_first)
+    return _mesh(*arrays), RealHull.of(triangles, index)
 
 
 def _mesh_arrays(launcher: Launcher, triangles: np.ndarray) -> tuple[Any, Any]:
@@ -246,11 +257,6 @@ def _upload_geometry(launcher: Launcher, host: _HostTriangles, real: Any, synthe
     geometry.material = launcher.array(host.material, wp.int32)
     geometry.double_sided = launcher.array(host.double_sided, wp.int32)
     return geometry
-
-
-def _real_hull(launcher: Launcher, host: _HostTriangles, geometry: Any) -> RealHull:
-    index = real_hull(launcher, geometry, host.vertices[: host.first], host.synthetic_first)
-    return RealHull.of(host.triangles[: host.synthetic_first], index)
 
 
 def _set_blockers(geometry: Any, blockers: Any, triangles: np.ndarray) -> None:

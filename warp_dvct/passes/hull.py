@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,41 +19,57 @@ MOST_REAL_TRIANGLES = 2**14  # rooms that were modelled; of scans hardly a trian
 CELLS = 32  # an edge of the grid by which vertices are grouped
 
 
+@dataclass(frozen=True)
+class Hulls:
+    """The synthetic objects as ``kernels.geometry.Geometry`` holds them.
+
+    Attributes:
+        center, extent, middle: vec3 ``[bodies]``. marks: int ``[synthetic triangles]``.
+    """
+
+    bodies: int
+    center: Any
+    extent: Any
+    middle: Any
+    marks: Any
+
+    def set(self, geometry: Any) -> None:
+        """Fill in what ``geometry`` says of bodies and hulls."""
+        geometry.bodies = self.bodies
+        geometry.body_center, geometry.body_extent, geometry.body_middle = self.center, self.extent, self.middle
+        geometry.hull = self.marks
+
+
 def mark_hulls(
-    launcher: Launcher, geometry: Any, boxes: np.ndarray, vertices: Sequence[np.ndarray], counts: Sequence[int]
-) -> None:
-    """Fill in what ``geometry`` says of bodies and hulls.
+    launcher: Launcher, corners: Any, boxes: np.ndarray, vertices: Sequence[np.ndarray], counts: Sequence[int]
+) -> Hulls:
+    """The hulls of synthetic meshes; of all of them together where they are many.
 
     Args:
-        geometry: ``kernels.geometry.Geometry`` with the synthetic triangles.
-        boxes: Low and high corners of each synthetic mesh's box, ``[m, 2, 3]``, in volume space.
-        vertices: Of each, float32 ``[v, 3]``. counts: Its triangles, in the order of the meshes.
+        corners: vec3 ``[3 * triangles]`` in volume space, in the order of the meshes.
+        boxes: Low and high corners of each mesh's box, ``[m, 2, 3]``.
+        vertices: Of each, float32 ``[v, 3]``. counts: Its triangles.
     """
     if len(counts) > MOST_BODIES:
         boxes = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])[None]
         vertices, counts = [np.concatenate(vertices)], [sum(counts)]
-    center, extent = middle_and_half(boxes)
-    geometry.bodies = len(counts)
-    geometry.body_center = launcher.array(center, wp.vec3)
-    geometry.body_extent = launcher.array(extent, wp.vec3)
+    center, extent = (launcher.array(v, wp.vec3) for v in middle_and_half(boxes))
     bodies = _bodies(launcher, vertices, counts)
-    bodies.first_triangle = geometry.synthetic_first
-    geometry.body_middle = bodies.middle
-    geometry.hull = hull_marks(launcher, geometry, bodies, sum(counts))
+    return Hulls(len(counts), center, extent, bodies.middle, _marks(launcher, corners, bodies, sum(counts)))
 
 
-def real_hull(launcher: Launcher, geometry: Any, vertices: Sequence[np.ndarray], count: int) -> np.ndarray:
+def real_hull(launcher: Launcher, corners: Any, vertices: Sequence[np.ndarray], count: int) -> np.ndarray:
     """Indices of the ``count`` real triangles that lie on the convex hull of them all; none where they are many."""
     if not 0 < count <= MOST_REAL_TRIANGLES:
         return np.zeros(0, np.int64)
     bodies = _bodies(launcher, [np.concatenate(vertices)], [count])
-    return np.flatnonzero(hull_marks(launcher, geometry, bodies, count).numpy() != kernels.NO_BODY)
+    return np.flatnonzero(_marks(launcher, corners, bodies, count).numpy() != kernels.NO_BODY)
 
 
-def hull_marks(launcher: Launcher, geometry: Any, bodies: Any, count: int) -> Any:
+def _marks(launcher: Launcher, corners: Any, bodies: Any, count: int) -> Any:
     """Per triangle of ``bodies``, int ``[count]``: the body on whose hull it lies, or ``kernels.NO_BODY``."""
     marks = launcher.empty(count, wp.int32)
-    launcher.launch(kernels._mark_hull, count, [geometry, bodies], [marks])
+    launcher.launch(kernels._mark_hull, count, [corners, bodies], [marks])
     return marks
 
 
