@@ -103,7 +103,7 @@ def test_a_moving_light_leaves_geometry_and_the_other_light():
     moving.set_scene(moment)
     assert same(moving.render(), relighter(moment).render())
     kept = moving.stats["kept"]
-    assert {name.split(",")[0] for name, reused in kept.items() if not reused} == {"real map of light 1"}
+    assert {name.split(",")[0] for name, reused in kept.items() if not reused} == {"real map of light 1", "lights"}
 
 
 def test_cones_read_all_levels(plate):
