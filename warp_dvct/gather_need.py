@@ -114,7 +114,7 @@ class GatherNeed:
 
 
 def _halved(stride: int, detail: float) -> bool:
-    """As ``passes.gather.gather_sparse`` decides."""
+    """As ``passes.gather.SparseGather`` decides."""
     return detail > 0.0 and stride > FINEST and stride % 2 == 0
 
 

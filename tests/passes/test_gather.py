@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_dvct.kernels.radiosity import World, radiosity_at
 from warp_dvct.launch import Launcher
-from warp_dvct.passes.gather import Gatherer, gather_all, gather_sparse, shade_indirect
+from warp_dvct.passes.gather import Gatherer, SparseGather, gather_all, shade_indirect
 from warp_dvct.passes.gbuffer import render_gbuffer
 from warp_dvct.scene import Light, LightKind, LightRole, Role
 
@@ -51,7 +51,8 @@ def seen(launcher, scene, width=75, height=61, samples=4):
 def sparse(launcher, buffer, gatherer, role=Role.REAL, *, stride=4, radius=2, smoothing=2):
     """What is written for a role, and -1 where nothing is."""
     before, after = (launcher.full(buffer.count, wp.vec3(-1.0, -1.0, -1.0), wp.vec3) for _ in range(2))
-    gather_sparse(launcher, buffer, role, gatherer, (before, after), stride=stride, radius=radius, smoothing=smoothing)
+    gather = SparseGather(launcher, buffer, role, gatherer, stride, radius, smoothing)
+    gather.write(gather.blocks(), (before, after))
     return before.numpy()[: buffer.count].astype(float), after.numpy()[: buffer.count].astype(float)
 
 

@@ -29,10 +29,10 @@ from warp_dvct.passes.environment import build_environment
 from warp_dvct.passes.gather import (
     HIDDEN,
     Gatherer,
+    SparseGather,
     Turns,
     focusing_materials,
     gather_all,
-    gather_sparse,
     glossy_hits,
     keep_rays,
     shade_indirect,
@@ -397,14 +397,21 @@ def _irradiance(
         "detail": settings.gather_detail,
     }
     change = 0.0 if part.with_before else settings.gather_change
-    # Turns settle their rays by what is left of a time: the larger part can make up for more, so it comes last.
-    if scene.synthetic is not None:
-        gather_sparse(
-            launcher, buffer, Role.SYNTHETIC, synthetic, irradiance, stride=settings.gather_object_stride, **how
-        )
-    gather_sparse(
-        launcher, buffer, Role.REAL, real, irradiance, stride=settings.gather_stride, change=change, kept=rays, **how
-    )
+    room = SparseGather(launcher, buffer, Role.REAL, real, settings.gather_stride, change=change, kept=rays, **how)
+    if scene.synthetic is None:
+        room.write(room.blocks(), irradiance)
+        return irradiance
+    objects = SparseGather(launcher, buffer, Role.SYNTHETIC, synthetic, settings.gather_object_stride, **how)
+    if turns is not None or cone is not None:
+        # Turns settle their rays by what is left of a time: the larger part can make up for more, so it comes last.
+        objects.write(objects.blocks(), irradiance)
+        room.write(room.blocks(), irradiance)
+        return irradiance
+    blocks = room.blocks()
+    with ExitStack() as beside:  # the rest of the room is many short launches
+        other_blocks = objects.blocks(beside)
+        room.write(blocks, irradiance)
+    objects.write(other_blocks, irradiance)
     return irradiance
 
 

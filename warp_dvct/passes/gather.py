@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -89,12 +90,15 @@ class Gatherer:
         *,
         stride: int = 1,
         part: str = "",
+        beside: ExitStack | None = None,
     ) -> tuple[Any, Any]:
         """Irradiance [W m^-2] before and after at points ``index`` (-1 gives 0): two vec3 ``[count]``.
 
         ``nearness``, float ``[count]``, receives the mean inverse distance of what rays met (cones leave it alone).
         ``stride``: Spacing of the points in pixels. ``part``: One of ``GATHER_PARTS``, for turns and :func:`rays_of`.
         ``kept``: ``KeptRays`` of ``count`` slots (:func:`keep_rays`), for pixels' centres on real surfaces.
+        ``beside``: Until it closes other work may go on beside the rays (:meth:`Launcher.beside`), and what is returned
+        is not all there; without ``turns`` and ``cone``.
         """
         if nearness is None:
             nearness = launcher.empty(max(1, count), wp.float32)
@@ -126,7 +130,10 @@ class Gatherer:
             ]
             runs = -(-count // kernels.RUN)
             elements = -(-runs // turn.of) * kernels.RUN * parts
-            launcher.launch(kernel, elements, [*shared, *how], outputs)
+            if beside is None:
+                launcher.launch(kernel, elements, [*shared, *how], outputs)
+            else:
+                beside.enter_context(launcher.beside(kernel, elements, [*shared, *how], outputs))
         if parts > 1:
             launcher.launch(kernels._sum_parts, count, [parts, *outputs], [before, after, nearness])
         return before, after
@@ -198,126 +205,128 @@ class _Grid:
         return guide
 
 
-def gather_sparse(
-    launcher: Launcher,
-    buffer: GBuffer,
-    role: Role,
-    gatherer: Gatherer,
-    irradiance: tuple[Any, Any],
-    *,
-    stride: int,
-    radius: int,
-    smoothing: int = 0,
-    detail: float = 0.0,
-    change: float = 0.0,
-    kept: Any = None,
-) -> None:
-    """Write irradiance, before and after, at every shading point of a role, and 0 at the background.
+@dataclass(frozen=True)
+class SparseGather:
+    """Irradiance, before and after, at every shading point of a role.
 
     One pixel of each ``stride`` x ``stride`` block is gathered; ``smoothing`` a-trous steps average the gathered values
     as far as the distance to what they see allows; the others are reconstructed from the blocks within
     ``radius`` that lie on the same surface. Points without any such block are gathered themselves.
 
-    Args:
-        irradiance: Where to: two vec3 ``[buffer.count]``.
+    Attributes:
         detail: Bound on the relative change of irradiance within a block (Ward et al. 1988) beyond which it is gathered
             at half the stride; 0 for never.
         change: Least change around a block, as a share of irradiance, for that; 0 for any. For pictures of which only
             the change is used.
         kept: ``KeptRays`` with a slot per block, for the role REAL.
     """
-    columns, rows = -(-buffer.width // stride), -(-buffer.height // stride)
-    parts = REAL_PARTS if role == Role.REAL else OBJECT_PARTS
-    gathered = _choose(launcher, buffer, stride, columns, rows, role, gatherer.seed)
-    nearness = launcher.zeros(columns * rows, wp.float32)
-    before, after = gatherer.run(
-        launcher, buffer.points, gathered.choice, columns * rows, nearness, kept, stride=stride, part=parts[0]
-    )
-    grid = _Grid(stride, columns, rows, gathered, nearness, before, after)
-    steps = smoothing if gatherer.cone is None else 0
-    grid = _smooth(launcher, buffer, grid, launcher.full(grid.count, 1, wp.int32), steps)
-    while detail > 0.0 and grid.stride > FINEST and grid.stride % 2 == 0 and gatherer.cone is None:
-        grid = _refine(launcher, buffer, role, gatherer, grid, radius, steps, detail, change)
-    missing = launcher.empty(buffer.count, wp.int32)
-    guide = grid.guide(radius if grid.stride > 1 else min(radius, 1))
-    launcher.launch(
-        reconstruction._reconstruct,
-        buffer.count,
-        [buffer.points, int(role), guide, grid.gathered, grid.before, grid.after],
-        [*irradiance, missing],
-    )
-    _, index, left = compact(launcher, missing)
-    found = gatherer.run(launcher, buffer.points, index, left, part=parts[2])
-    launcher.launch(reconstruction._scatter_missing, left, [index, *found], [*irradiance])
 
+    launcher: Launcher
+    buffer: GBuffer
+    role: Role
+    gatherer: Gatherer
+    stride: int
+    radius: int
+    smoothing: int = 0
+    detail: float = 0.0
+    change: float = 0.0
+    kept: Any = None
 
-def _choose(launcher: Launcher, buffer: GBuffer, stride: int, columns: int, rows: int, role: Role, seed: int) -> Any:
-    gathered = reconstruction.Gathered()
-    gathered.choice = launcher.empty(columns * rows, wp.int32)
-    gathered.center = launcher.empty(columns * rows, wp.vec2)
-    gathered.triangle = launcher.empty(columns * rows, wp.int32)
-    gathered.position, gathered.normal_g, gathered.normal = (launcher.empty(columns * rows, wp.vec3) for _ in range(3))
-    window = buffer.window if role == Role.SYNTHETIC else (0, buffer.width - 1, 0, buffer.height - 1)
-    launcher.launch(
-        reconstruction._choose_points,
-        columns * rows,
-        [buffer.points, buffer.width, buffer.height, stride, columns, wp.vec4i(*window), int(role), seed],
-        [gathered],
-    )
-    return gathered
-
-
-def _smooth(launcher: Launcher, buffer: GBuffer, grid: _Grid, mark: Any, steps: int) -> _Grid:
-    """The grid after ``steps`` a-trous steps over its marked blocks."""
-    for step in range(steps):
-        before, after = launcher.empty(grid.count, wp.vec3), launcher.empty(grid.count, wp.vec3)
-        launcher.launch(
-            reconstruction._smooth,
-            grid.count,
-            [buffer.points, grid.gathered, grid.guide(2), 1 << step, mark, grid.before, grid.after, grid.nearness],
-            [before, after],
+    def blocks(self, beside: ExitStack | None = None) -> _Grid:
+        """The blocks' points and what they gather (``beside``: as in :meth:`Gatherer.run`)."""
+        columns, rows = -(-self.buffer.width // self.stride), -(-self.buffer.height // self.stride)
+        gathered = self._choose(self.stride, columns, rows)
+        nearness = self.launcher.zeros(columns * rows, wp.float32)
+        before, after = self.gatherer.run(
+            self.launcher,
+            self.buffer.points,
+            gathered.choice,
+            columns * rows,
+            nearness,
+            self.kept,
+            stride=self.stride,
+            part=self._parts[0],
+            beside=beside,
         )
-        grid = replace(grid, before=before, after=after)
-    return grid
+        return _Grid(self.stride, columns, rows, gathered, nearness, before, after)
 
+    def write(self, grid: _Grid, irradiance: tuple[Any, Any]) -> None:
+        """Write to two vec3 ``[buffer.count]`` what follows from the :meth:`blocks`; 0 at the background."""
+        launcher, points = self.launcher, self.buffer.points
+        grid = self._smooth(grid, launcher.full(grid.count, 1, wp.int32))
+        while self.detail > 0.0 and grid.stride > FINEST and grid.stride % 2 == 0 and self.gatherer.cone is None:
+            grid = self._refine(grid)
+        missing = launcher.empty(self.buffer.count, wp.int32)
+        guide = grid.guide(self.radius if grid.stride > 1 else min(self.radius, 1))
+        launcher.launch(
+            reconstruction._reconstruct,
+            self.buffer.count,
+            [points, int(self.role), guide, grid.gathered, grid.before, grid.after],
+            [*irradiance, missing],
+        )
+        _, index, left = compact(launcher, missing)
+        found = self.gatherer.run(launcher, points, index, left, part=self._parts[2])
+        launcher.launch(reconstruction._scatter_missing, left, [index, *found], [*irradiance])
 
-def _refine(
-    launcher: Launcher,
-    buffer: GBuffer,
-    role: Role,
-    gatherer: Gatherer,
-    grid: _Grid,
-    radius: int,
-    smoothing: int,
-    detail: float,
-    change: float,
-) -> _Grid:
-    """A grid of half the stride: gathered where ``grid`` cannot tell, interpolated elsewhere."""
-    points, stride = buffer.points, grid.stride // 2
-    columns, rows = -(-buffer.width // stride), -(-buffer.height // stride)
-    count = columns * rows
-    gathered = _choose(launcher, buffer, stride, columns, rows, role, gatherer.seed)
-    mark = launcher.empty(count, wp.int32)
-    nearness = launcher.empty(count, wp.float32)
-    before, after = launcher.empty(count, wp.vec3), launcher.empty(count, wp.vec3)
-    coarse = [grid.gathered, grid.nearness, grid.before, grid.after]
-    launcher.launch(
-        reconstruction._find_detail,
-        count,
-        [points, columns, gathered, grid.guide(radius), *coarse, detail],
-        [mark, nearness, before, after],
-    )
-    if change > 0.0:
-        inputs = [grid.columns, grid.rows, columns, grid.before, grid.after, before, change]
-        launcher.launch(changed_detail._unmark_unchanged, count, inputs, [mark])
-    _, listed, found = compact(launcher, mark)
-    index = launcher.empty(max(1, found), wp.int32)
-    launcher.launch(reconstruction._pick, found, [listed, gathered.choice], [index])
-    near = launcher.empty(max(1, found), wp.float32)
-    part = (REAL_PARTS if role == Role.REAL else OBJECT_PARTS)[1]
-    fresh = gatherer.run(launcher, points, index, found, near, stride=stride, part=part)
-    launcher.launch(reconstruction._put_detail, found, [listed, *fresh, near], [before, after, nearness])
-    return _smooth(launcher, buffer, _Grid(stride, columns, rows, gathered, nearness, before, after), mark, smoothing)
+    @property
+    def _parts(self) -> tuple[str, ...]:
+        return REAL_PARTS if self.role == Role.REAL else OBJECT_PARTS
+
+    def _choose(self, stride: int, columns: int, rows: int) -> Any:
+        launcher, buffer, count = self.launcher, self.buffer, columns * rows
+        gathered = reconstruction.Gathered()
+        gathered.choice = launcher.empty(count, wp.int32)
+        gathered.center = launcher.empty(count, wp.vec2)
+        gathered.triangle = launcher.empty(count, wp.int32)
+        gathered.position, gathered.normal_g, gathered.normal = (launcher.empty(count, wp.vec3) for _ in range(3))
+        window = buffer.window if self.role == Role.SYNTHETIC else (0, buffer.width - 1, 0, buffer.height - 1)
+        how = [stride, columns, wp.vec4i(*window), int(self.role), self.gatherer.seed]
+        launcher.launch(
+            reconstruction._choose_points, count, [buffer.points, buffer.width, buffer.height, *how], [gathered]
+        )
+        return gathered
+
+    def _smooth(self, grid: _Grid, mark: Any) -> _Grid:
+        """The grid after the a-trous steps over its marked blocks; cones are smooth."""
+        launcher = self.launcher
+        for step in range(self.smoothing if self.gatherer.cone is None else 0):
+            before, after = launcher.empty(grid.count, wp.vec3), launcher.empty(grid.count, wp.vec3)
+            now = [mark, grid.before, grid.after, grid.nearness]
+            launcher.launch(
+                reconstruction._smooth,
+                grid.count,
+                [self.buffer.points, grid.gathered, grid.guide(2), 1 << step, *now],
+                [before, after],
+            )
+            grid = replace(grid, before=before, after=after)
+        return grid
+
+    def _refine(self, grid: _Grid) -> _Grid:
+        """A grid of half the stride: gathered where ``grid`` cannot tell, interpolated elsewhere."""
+        launcher, points, stride = self.launcher, self.buffer.points, grid.stride // 2
+        columns, rows = -(-self.buffer.width // stride), -(-self.buffer.height // stride)
+        count = columns * rows
+        gathered = self._choose(stride, columns, rows)
+        mark = launcher.empty(count, wp.int32)
+        nearness = launcher.empty(count, wp.float32)
+        before, after = launcher.empty(count, wp.vec3), launcher.empty(count, wp.vec3)
+        coarse = [grid.gathered, grid.nearness, grid.before, grid.after]
+        launcher.launch(
+            reconstruction._find_detail,
+            count,
+            [points, columns, gathered, grid.guide(self.radius), *coarse, self.detail],
+            [mark, nearness, before, after],
+        )
+        if self.change > 0.0:
+            inputs = [grid.columns, grid.rows, columns, grid.before, grid.after, before, self.change]
+            launcher.launch(changed_detail._unmark_unchanged, count, inputs, [mark])
+        _, listed, found = compact(launcher, mark)
+        index = launcher.empty(max(1, found), wp.int32)
+        launcher.launch(reconstruction._pick, found, [listed, gathered.choice], [index])
+        near = launcher.empty(max(1, found), wp.float32)
+        fresh = self.gatherer.run(launcher, points, index, found, near, stride=stride, part=self._parts[1])
+        launcher.launch(reconstruction._put_detail, found, [listed, *fresh, near], [before, after, nearness])
+        return self._smooth(_Grid(stride, columns, rows, gathered, nearness, before, after), mark)
 
 
 def gather_all(launcher: Launcher, points: Any, count: int, gatherer: Gatherer, *, part: str = "") -> tuple[Any, Any]:
