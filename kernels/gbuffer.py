@@ -248,9 +248,18 @@ def differs(points: Points, i: int, j: int, paint: int) -> bool:
 
 
 @wp.kernel
-def _mark_edges(first: int, points: Points, width: int, height: int, paint: int, mark_out: wp.array(dtype=wp.int32)):
-    """1 where any of the eight neighbours shows another surface, or another colour (of real ones if ``paint``)."""
-    i = first + wp.tid()
+def _mark_edges(
+    first: int,
+    points: Points,
+    width: int,
+    height: int,
+    paint: int,
+    first_pixel: int,
+    mark_out: wp.array(dtype=wp.int32),
+):
+    """1 where any of the eight neighbours shows another surface, or another colour (of real ones if ``paint``); for
+    pixels from ``first_pixel`` on."""
+    i = first + wp.tid() + first_pixel
     x = i % width
     y = i / width
     left = wp.max(x - 1, 0)

@@ -35,6 +35,7 @@ class Lights:
     axis_y: wp.array(dtype=wp.vec3)
     direction: wp.array(dtype=wp.vec3)  # in which the light travels; the plane's normal for RECT and DISK
     radius: wp.array(dtype=float)
+    bound: wp.array(dtype=float)  # of a sphere around the position that holds all but DISTANT and DOME
     area: wp.array(dtype=float)  # RECT, DISK
     cap: wp.array(dtype=float)  # DISTANT: 1 - cos(angle / 2)
     cone_angle: wp.array(dtype=float)  # pi where the light is no spot

@@ -119,7 +119,7 @@ def box_may_shadow(center: wp.vec3, extent: wp.vec3, lights: Lights, i: int, pos
         to_light = lights.position[i] - position
         far2 = wp.length_sq(to_light)
         size = wp.abs(lights.axis_x[i]) + wp.abs(lights.axis_y[i])
-        bound = lights.radius[i] + wp.length(size)
+        bound = lights.bound[i]
         if far2 <= bound * bound:
             return True
         size = size + wp.vec3(lights.radius[i], lights.radius[i], lights.radius[i])
@@ -213,8 +213,9 @@ def unlit(lights: Lights, k: int, position: wp.vec3, normal: wp.vec3) -> bool:
         cap = lights.cap[k]
         return -wp.dot(lights.direction[k], normal) < -wp.sqrt(wp.max(cap * (2.0 - cap), 0.0)) - UNLIT_MARGIN
     to_light = lights.position[k] - position
-    bound = lights.radius[k] + wp.length(lights.axis_x[k]) + wp.length(lights.axis_y[k])
-    margin = UNLIT_MARGIN * (bound + wp.length(to_light))
+    bound = lights.bound[k]
+    away = wp.abs(to_light)
+    margin = UNLIT_MARGIN * (bound + away[0] + away[1] + away[2])
     if wp.dot(to_light, normal) < -bound - margin:
         return True
     planar = lights.kind[k] == RECT or lights.kind[k] == DISK

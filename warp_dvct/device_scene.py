@@ -329,6 +329,7 @@ def upload_lights(launcher: Launcher, lights: tuple[Light, ...], origin: np.ndar
     out.axis_y = vectors(b for _, b in axes)
     out.direction = vectors(_emission_axis(x) for x in lights)
     out.radius = floats(x.radius * scale for x in lights)
+    out.bound = floats(x.radius * scale + _half_diagonal(*ab) for x, ab in zip(lights, axes, strict=True))
     out.area = floats(_area(x, *ab) for x, ab in zip(lights, axes, strict=True))
     out.cap = floats(2.0 * np.sin(0.25 * x.angle) ** 2 for x in lights)
     # pi stands for "no spot"; it is compared as float32, to which the kernels' own pi rounds as well.
@@ -349,6 +350,10 @@ def upload_lights(launcher: Launcher, lights: tuple[Light, ...], origin: np.ndar
 
 def _starts(sizes: list[int]) -> np.ndarray:
     return np.cumsum([0, *sizes])[:-1]
+
+
+def _half_diagonal(axis_x: np.ndarray, axis_y: np.ndarray) -> float:
+    return float(max(np.linalg.norm(axis_x + axis_y), np.linalg.norm(axis_x - axis_y)))
 
 
 def _area(light: Light, axis_x: np.ndarray, axis_y: np.ndarray) -> float:

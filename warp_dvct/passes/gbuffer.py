@@ -56,10 +56,15 @@ class View:
         points: ``Points``, entry ``p`` is pixel ``p``: of the real scene alone at first, then with the last frame's
             objects in it, which the next frame takes out again. What lies behind pixels is room for edge points.
         reach: float ``[pixels]``, where rays into the real scene end.
+        marks: int ``[pixels]``, the last frame's edge pixels. painted: Whether colours made edges then; None before.
+        rows: First and last row that the objects of the last frame may have reached.
     """
 
     points: Any
     reach: Any
+    marks: Any = None
+    painted: bool | None = None
+    rows: tuple[int, int] = (0, -1)
 
 
 def see_real(launcher: Launcher, scene: DeviceScene, width: int, height: int, *, edge_room: int = 0) -> View:
@@ -126,10 +131,11 @@ def render_gbuffer(
     window = objects_window(scene, width, height)
     inputs = [*shared, view.reach, wp.vec4i(*window), width, height]
     launcher.launch(kernels._see_synthetic, pixels, inputs, [view.points])
-    mark = launcher.zeros(pixels, wp.int32)
     if edge_samples > 0:
-        launcher.launch(kernels._mark_edges, pixels, [view.points, width, height, int(paint)], [mark])
-    edge_rank, edge_pixel, edges = compact(launcher, mark)
+        _mark_edges(launcher, view, width, height, window, paint)
+    else:
+        view.marks = launcher.zeros(pixels, wp.int32)
+    edge_rank, edge_pixel, edges = compact(launcher, view.marks)
     count = pixels + edges * edge_samples
     view.points = extended(launcher, view.points, pixels, count)
     points = first_points(view.points, count)
@@ -140,6 +146,20 @@ def render_gbuffer(
     if behind:
         hidden = _look_behind(launcher, scene, points, count, width)
     return GBuffer(width, height, edge_samples, points, count, window, edge_rank, edge_pixel, *hidden)
+
+
+def _mark_edges(
+    launcher: Launcher, view: View, width: int, height: int, window: tuple[int, int, int, int], paint: bool
+) -> None:
+    """Mark the edge pixels of a view; anew only beside rows in which objects are, or were in the last frame."""
+    rows = (window[2], window[3]) if window[0] <= window[1] else (height, -1)
+    low, high = max(min(rows[0], view.rows[0]) - 1, 0), min(max(rows[1], view.rows[1]) + 1, height - 1)
+    if view.painted != paint:
+        view.marks = launcher.empty(width * height, wp.int32)
+        low, high = 0, height - 1
+    inputs = [view.points, width, height, int(paint), low * width]
+    launcher.launch(kernels._mark_edges, (high - low + 1) * width, inputs, [view.marks])
+    view.painted, view.rows = paint, rows
 
 
 def compact(launcher: Launcher, mark: Any) -> tuple[Any, Any, int]:
