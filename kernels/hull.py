@@ -31,8 +31,16 @@ class Bodies:
 
 
 @wp.kernel
-def _mark_hull(first: int, corner_in: wp.array(dtype=wp.vec3), bodies: Bodies, hull_out: wp.array(dtype=wp.int32)):
-    """The body of each triangle that lies on its convex hull, else NO_BODY.
+def _mark_hull(
+    first: int,
+    corner_in: wp.array(dtype=wp.vec3),
+    bodies: Bodies,
+    facing: int,
+    eye: wp.vec3,
+    hull_out: wp.array(dtype=wp.int32),
+):
+    """The body of each triangle that lies on its convex hull, else NO_BODY; where ``facing`` is set, of those alone
+    that show ``eye`` their outer side.
 
     Its plane is that of ``materials.surface_at``, and vertices count as below where they are by half of the step that
     ``materials.spawn_point`` takes: a ray that begins there and goes outwards stays above all of them.
@@ -50,6 +58,8 @@ def _mark_hull(first: int, corner_in: wp.array(dtype=wp.vec3), bodies: Bodies, h
         return
     if wp.dot(normal, bodies.middle[body] - p) > 0.0:
         normal = -normal
+    if facing != 0 and wp.dot(normal, eye - p) <= 0.0:
+        return
     reach = wp.max(largest_coordinate(p), wp.max(largest_coordinate(q), largest_coordinate(r)))
     lowest = wp.min(0.0, wp.min(wp.dot(normal, q - p), wp.dot(normal, r - p)))
     limit = lowest + 0.5 * OFFSET_RELATIVE * reach

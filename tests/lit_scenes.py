@@ -17,10 +17,19 @@ from warp_dvct.methods.delta_cone_tracing import _normals, _world
 from warp_dvct.passes.gbuffer import new_points
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
 from warp_dvct.passes.voxels import Box, Voxels, voxelize
-from warp_dvct.scene import Camera, Light, Material, Mesh, Role, Scene
+from warp_dvct.scene import Camera, Light, LightKind, Material, Mesh, Role, Scene
 
 GREY = Material(base_color=(0.5, 0.4, 0.3), ior=1.0)
 CENTER = np.array([0.5, 0.5, 0.5])
+LAMP = Light(  # under the ceiling of ``room(0.45)``
+    LightKind.RECT,
+    (8.0, 7.0, 6.0),
+    position=(0.5, 0.94, 0.5),
+    axis_x=(0.15, 0, 0),
+    axis_y=(0, 0, 0.15),
+    direction=(0, -1, 0),
+    path="/World/Lamp",
+)
 EYES = np.eye(3)
 
 

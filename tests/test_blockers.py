@@ -12,15 +12,6 @@ from warp_dvct.device_scene import DeviceScene
 from warp_dvct.relighter import Relighter
 from warp_dvct.scene import Light, LightKind, LightRole, Material, Role
 
-LAMP = Light(
-    LightKind.RECT,
-    (8.0, 7.0, 6.0),
-    position=(0.5, 0.95, 0.5),
-    axis_x=(0.15, 0, 0),
-    axis_y=(0, 0, 0.15),
-    direction=(0, -1, 0),
-    path="/World/Lamp",
-)
 BULB = Light(LightKind.SPHERE, (20.0, 20.0, 30.0), position=(0.2, 0.6, 0.7), radius=0.03, path="/World/Bulb")
 SUN = Light(LightKind.DISTANT, (3.0, 3.0, 2.5), direction=(0.3, -1.0, 0.2), angle=0.02, path="/World/Sun")
 ROOM = 12  # triangles, the first of every scene; on the planes 0.05 and 0.95
@@ -59,11 +50,11 @@ def heights(indices) -> set[float]:
 
 
 def test_walls_hide_nothing_from_lights_in_the_room(launcher):
-    np.testing.assert_array_equal(left_out(launcher, scene(LAMP, BULB)), np.arange(ROOM))
+    np.testing.assert_array_equal(left_out(launcher, scene(lit.LAMP, BULB)), np.arange(ROOM))
 
 
 def test_a_lamp_beyond_the_ceiling_is_hidden_by_it(launcher):
-    outside = replace(LAMP, position=(0.5, 0.97, 0.5))
+    outside = replace(lit.LAMP, position=(0.5, 0.97, 0.5))
     out = left_out(launcher, scene(outside, BULB))
     assert len(out) == ROOM - 2
     assert heights(out) == {FLOOR_Y}
@@ -79,7 +70,7 @@ def test_the_sun_is_hidden_by_walls_and_ceiling_but_not_by_the_floor(launcher):
 
 
 def test_an_object_that_stands_out_of_the_floor_keeps_it(launcher):
-    out = left_out(launcher, scene(LAMP, center=(0.6, 0.12, 0.5)))
+    out = left_out(launcher, scene(lit.LAMP, center=(0.6, 0.12, 0.5)))
     assert heights(out) == {0.95}
 
 
@@ -101,11 +92,11 @@ def from_outside(*lights):
 
 SHINY = Material(base_color=(0.6, 0.5, 0.4), roughness=0.3, metallic=1.0)
 SCENES = {
-    "room": scene(LAMP, replace(BULB, role=LightRole.ADDED)),
-    "glossy room": scene(LAMP, BULB, materials=(SHINY,)),
+    "room": scene(lit.LAMP, replace(BULB, role=LightRole.ADDED)),
+    "glossy room": scene(lit.LAMP, BULB, materials=(SHINY,)),
     "ground": outdoors(SUN, BULB),
-    "room from outside": from_outside(LAMP, BULB),
-    "lamp in the ceiling's plane": scene(LAMP),
+    "room from outside": from_outside(lit.LAMP, BULB),
+    "lamp in the ceiling's plane": scene(replace(lit.LAMP, position=(0.5, 0.95, 0.5))),
 }
 
 
@@ -125,11 +116,11 @@ def test_pictures_are_the_same_where_all_triangles_are_asked(monkeypatch, name, 
 
 def test_a_shot_keeps_them_until_an_object_leaves_the_room():
     options = {"settings": SETTINGS, "width": 32, "height": 24, "threads": 2}
-    moving = Relighter(scene(LAMP), **options)
+    moving = Relighter(scene(lit.LAMP), **options)
     moving.render()
     kept = []
     for y in (0.21, 0.12):
-        moving.set_scene(scene(LAMP, center=(0.6, y, 0.5)))
+        moving.set_scene(scene(lit.LAMP, center=(0.6, y, 0.5)))
         moving.render()
         kept.append(moving.stats["kept"]["blockers"])
     assert kept == [True, False]

@@ -29,15 +29,6 @@ SMALL = {
     "bounces": 3,
 }
 SHINY = Material(base_color=(0.6, 0.5, 0.4), roughness=0.3)
-LAMP = Light(
-    LightKind.RECT,
-    (8.0, 7.0, 6.0),
-    position=(0.5, 0.94, 0.5),
-    axis_x=(0.15, 0, 0),
-    axis_y=(0, 0, 0.15),
-    direction=(0, -1, 0),
-    path="/World/Lamp",
-)
 BULB = Light(LightKind.POINT, (0.2, 0.2, 0.3), position=(0.25, 0.6, 0.7), role=LightRole.ADDED, path="/World/Bulb")
 
 
@@ -51,7 +42,7 @@ def scene(offset=(0.0, 0.0, 0.0), *, bulb=(0.0, 0.0, 0.0), lights=2, material=li
     to_world = np.eye(4)
     to_world[:3, 3] = (camera_x, 0.5, 0.93)
     moved = replace(BULB, position=tuple(np.array(BULB.position) + bulb))
-    made = lit.scene_of(*parts, lights=(LAMP, moved)[:lights], materials=(material,))
+    made = lit.scene_of(*parts, lights=(lit.LAMP, moved)[:lights], materials=(material,))
     return replace(made, camera=Camera(to_world, -0.8, 0.8, -0.6, 0.6, path="/World/Camera"))
 
 
@@ -224,7 +215,7 @@ def test_shot_moves_objects_or_a_light_and_nothing_else():
         assert np.ptp(offsets[2], 0).max() < 1e-12
         assert abs(offsets[2][0, 1]) < 1e-12, "the camera's up is y"
         assert moment.lights is still.lights
-    assert {m.lights[0].position for m in shot(still, 8, True)} != {LAMP.position}
+    assert {m.lights[0].position for m in shot(still, 8, True)} != {lit.LAMP.position}
     with pytest.raises(OptionError, match="no light"):
         shot(replace(still, lights=()), 8, True)
     with pytest.raises(OptionError, match="at least 2"):

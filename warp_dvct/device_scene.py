@@ -7,7 +7,7 @@ irradiance are invariant, and the radiant intensity of POINT lights is multiplie
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from warp_dvct.kernels.geometry import FAR, CameraFrame, Geometry
 from warp_dvct.kernels.lights import Lights
 from warp_dvct.kernels.materials import Materials
 from warp_dvct.launch import Launcher
-from warp_dvct.passes.hull import mark_hulls, real_hull
+from warp_dvct.passes.hull import Hulls, new_hulls, real_hull
 from warp_dvct.passes.sidedness import lit_from_behind
 from warp_dvct.scene import Camera, Light, LightKind, Material, Mesh, Role, Scene, Texture
 from warp_dvct.targets import targets_of
@@ -38,6 +38,7 @@ class DeviceScene:
 
     Attributes:
         geometry, materials, lights, camera: Kernel structs, in volume space.
+        hulls: What of ``geometry`` depends on the camera: see :meth:`seen_by`.
         real, synthetic: The acceleration structures (``wp.Mesh``); None where there are no such triangles.
         blockers: That of the real triangles which can lie between a surface and a light (:mod:`warp_dvct.blockers`).
         targets: Where the synthetic triangles are (``kernels.aim.Targets``), see :func:`warp_dvct.targets.targets_of`.
@@ -54,6 +55,7 @@ class DeviceScene:
     materials: Any
     lights: Any
     camera: Any
+    hulls: Hulls
     real: Any
     synthetic: Any
     blockers: Any
@@ -94,7 +96,9 @@ class DeviceScene:
         lights = kept.get(
             "lights", content_key(scene.lights), lambda: upload_lights(launcher, scene.lights, origin, scale)
         )
-        hulls = mark_hulls(launcher, corners, boxes, host.vertices[host.first :], host.counts[host.first :])
+        camera = camera_frame(scene.camera, origin, scale)
+        hulls = new_hulls(launcher, corners, boxes, host.vertices[host.first :], host.counts[host.first :])
+        hulls.look_from(launcher, camera.origin)
         real, hull = kept.get("real triangles", None, lambda: _real(launcher, host))
         synthetic = building()
         geometry = _upload_geometry(launcher, host, real, synthetic, boxes)
@@ -112,7 +116,8 @@ class DeviceScene:
             geometry=geometry,
             materials=materials,
             lights=lights,
-            camera=camera_frame(scene.camera, origin, scale),
+            camera=camera,
+            hulls=hulls,
             real=real,
             synthetic=synthetic,
             blockers=blockers,
@@ -125,6 +130,12 @@ class DeviceScene:
             origin=origin,
             scale=float(scale),
         )
+
+    def seen_by(self, launcher: Launcher, camera: Camera) -> DeviceScene:
+        """The same scene with another camera."""
+        frame = camera_frame(camera, self.origin, self.scale)
+        self.hulls.look_from(launcher, frame.origin)
+        return replace(self, camera=frame)
 
     @property
     def synthetic_first(self) -> int:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from warp_dvct.device_scene import DeviceScene, camera_frame
+from warp_dvct.device_scene import DeviceScene
 from warp_dvct.enclosure import within_enclosure
 from warp_dvct.errors import OptionError
 from warp_dvct.kept import Kept, content_key
@@ -284,7 +284,7 @@ class Relighter:
                 self._kept.set_real(real)
                 uploaded = DeviceScene.upload(self._launcher, self._drawn, origin, scale, self._kept)
             self._uploaded = (key, uploaded, None)
-        return replace(self._uploaded[1], camera=camera_frame(self._drawn.camera, origin, scale))
+        return self._uploaded[1].seen_by(self._launcher, self._drawn.camera)
 
     def _lit(self, kind: type[LitKind], make: Callable[[], LitKind]) -> LitKind:
         """What the method made of the light of the scene on the device, kept until something else than the camera

@@ -19,31 +19,41 @@ MOST_REAL_TRIANGLES = 2**14  # rooms that were modelled; of scans hardly a trian
 CELLS = 32  # an edge of the grid by which vertices are grouped
 
 
-@dataclass(frozen=True)
+@dataclass
 class Hulls:
     """The synthetic objects as ``kernels.geometry.Geometry`` holds them.
 
     Attributes:
-        center, extent, middle: vec3 ``[bodies]``. marks: int ``[synthetic triangles]``.
+        count: Bodies. center, extent: vec3 ``[bodies]``, of their boxes.
+        marks: int ``[synthetic triangles]``: on whose hull a triangle lies that shows ``eye`` its outer side.
+        bodies: ``kernels.Bodies``. corners: vec3 ``[3 * synthetic triangles]``.
     """
 
-    bodies: int
+    count: int
     center: Any
     extent: Any
-    middle: Any
     marks: Any
+    bodies: Any
+    corners: Any
+    eye: tuple[float, ...] | None = None
 
     def set(self, geometry: Any) -> None:
         """Fill in what ``geometry`` says of bodies and hulls."""
-        geometry.bodies = self.bodies
-        geometry.body_center, geometry.body_extent, geometry.body_middle = self.center, self.extent, self.middle
-        geometry.hull = self.marks
+        geometry.bodies, geometry.hull = self.count, self.marks
+        geometry.body_center, geometry.body_extent, geometry.body_middle = self.center, self.extent, self.bodies.middle
+
+    def look_from(self, launcher: Launcher, eye: Any) -> None:
+        """Mark what a camera at ``eye`` sees; triangles that it does not see need no marks, and marking takes time."""
+        if self.eye != tuple(eye):
+            self.eye = tuple(eye)
+            inputs = [self.corners, self.bodies, 1, wp.vec3(*eye)]
+            launcher.launch(kernels._mark_hull, self.marks.shape[0], inputs, [self.marks])
 
 
-def mark_hulls(
+def new_hulls(
     launcher: Launcher, corners: Any, boxes: np.ndarray, vertices: Sequence[np.ndarray], counts: Sequence[int]
 ) -> Hulls:
-    """The hulls of synthetic meshes; of all of them together where they are many.
+    """The hulls of synthetic meshes, or of all of them together where they are many; not marked yet.
 
     Args:
         corners: vec3 ``[3 * triangles]`` in volume space, in the order of the meshes.
@@ -54,23 +64,18 @@ def mark_hulls(
         boxes = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])[None]
         vertices, counts = [np.concatenate(vertices)], [sum(counts)]
     center, extent = (launcher.array(v, wp.vec3) for v in middle_and_half(boxes))
-    bodies = _bodies(launcher, vertices, counts)
-    return Hulls(len(counts), center, extent, bodies.middle, _marks(launcher, corners, bodies, sum(counts)))
+    marks = launcher.empty(sum(counts), wp.int32)
+    return Hulls(len(counts), center, extent, marks, _bodies(launcher, vertices, counts), corners)
 
 
 def real_hull(launcher: Launcher, corners: Any, vertices: Sequence[np.ndarray], count: int) -> np.ndarray:
     """Indices of the ``count`` real triangles that lie on the convex hull of them all; none where they are many."""
     if not 0 < count <= MOST_REAL_TRIANGLES:
         return np.zeros(0, np.int64)
-    bodies = _bodies(launcher, [np.concatenate(vertices)], [count])
-    return np.flatnonzero(_marks(launcher, corners, bodies, count).numpy() != kernels.NO_BODY)
-
-
-def _marks(launcher: Launcher, corners: Any, bodies: Any, count: int) -> Any:
-    """Per triangle of ``bodies``, int ``[count]``: the body on whose hull it lies, or ``kernels.NO_BODY``."""
     marks = launcher.empty(count, wp.int32)
-    launcher.launch(kernels._mark_hull, count, [corners, bodies], [marks])
-    return marks
+    bodies = _bodies(launcher, [np.concatenate(vertices)], [count])
+    launcher.launch(kernels._mark_hull, count, [corners, bodies, 0, wp.vec3()], [marks])
+    return np.flatnonzero(marks.numpy() != kernels.NO_BODY)
 
 
 def _bodies(launcher: Launcher, vertices: Sequence[np.ndarray], counts: Sequence[int]) -> Any:
