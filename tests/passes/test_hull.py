@@ -108,7 +108,7 @@ def test_a_camera_that_moves_on_alone_is_marked_for(monkeypatch):
     options = {"settings": SETTINGS, "width": 64, "height": 48, "threads": 2}
     moving = Relighter(still, **options)
     moving.render()
-    before = moving._uploaded[1].geometry.hull.numpy()
+    before = moving._uploaded[1].geometry.hull.numpy().copy()
     moving.set_scene(turned)
     frame = moving.render()
     after = moving._uploaded[1].geometry.hull.numpy()
