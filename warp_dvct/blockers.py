@@ -25,7 +25,7 @@ class RealHull:
         index: Which triangles, ``[h]``. normal: Their unit normals, away from the scene, float64 ``[h, 3]``.
         level: Distance of their planes from the origin along the normal, ``[h]``.
         slack: How far above its plane a point still counts as on it, ``[h]``: half the step by which rays leave it.
-        area: Of all real triangles, ``[t]``.
+        area: Of all real triangles, ``[t]``; 0 where none is on the hull.
     """
 
     index: np.ndarray
@@ -37,12 +37,14 @@ class RealHull:
     @staticmethod
     def of(triangles: np.ndarray, index: np.ndarray) -> RealHull:
         """From all real triangles ``[t, 3, 3]`` and which of them are on the hull."""
+        if not len(index):
+            return RealHull(index, np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(len(triangles)))
         corners = triangles.astype(np.float64)
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         twice = np.linalg.norm(cross, axis=-1)
         normal = cross[index] / twice[index, None]
         level = np.einsum("ij,ij->i", normal, corners[index, 0])
-        middle = corners.reshape(-1, 3).mean(0) if len(corners) else np.zeros(3)
+        middle = corners.reshape(-1, 3).mean(0)
         side = np.where(normal @ middle > level, -1.0, 1.0)
         slack = 0.5 * float(OFFSET_RELATIVE) * np.abs(corners[index]).max((1, 2), initial=0.0)
         return RealHull(index, normal * side[:, None], level * side, slack, 0.5 * twice)
@@ -55,6 +57,8 @@ class RealHull:
             lights: Domes do not count: rays to them end nowhere.
             origin, scale: Of volume space.
         """
+        if not len(self.index):
+            return np.ones(len(self.area), bool)
         below = self._holds(boxes.astype(np.float64))
         for light in lights:
             below &= self._lit_from_inside(light, origin, scale)

@@ -16,7 +16,7 @@ import warp as wp
 from warp_dvct.blockers import RealHull
 from warp_dvct.boxes import around_runs, middle_and_half
 from warp_dvct.errors import StageError
-from warp_dvct.kept import Kept, content_key
+from warp_dvct.kept import Kept
 from warp_dvct.kernels.geometry import FAR, CameraFrame, Geometry
 from warp_dvct.kernels.lights import Lights
 from warp_dvct.kernels.materials import Materials
@@ -93,9 +93,8 @@ class DeviceScene:
         corners, building = _begin_mesh(launcher, host.triangles[first:])
         # Beside the tree's building: nothing here asks it.
         materials = kept.get("materials", None, lambda: _upload_materials(launcher, scene.materials, scene.textures))
-        lights = kept.get(
-            "lights", content_key(scene.lights), lambda: upload_lights(launcher, scene.lights, origin, scale)
-        )
+        light_keys = tuple(kept.light_key(scene, i) for i in range(len(scene.lights)))
+        lights = kept.get("lights", light_keys, lambda: upload_lights(launcher, scene.lights, origin, scale))
         camera = camera_frame(scene.camera, origin, scale)
         hulls = new_hulls(launcher, corners, boxes, host.vertices[host.first :], host.counts[host.first :])
         hulls.look_from(launcher, camera.origin)
@@ -104,12 +103,8 @@ class DeviceScene:
         geometry = _upload_geometry(launcher, host, real, synthetic, boxes)
         hulls.set(geometry)
         blocking = hull.blocking(boxes, scene.lights, origin, scale)
-        blockers = kept.get(
-            "blockers",
-            blocking.tobytes(),
-            lambda: real if blocking.all() else _mesh(*_mesh_arrays(launcher, host.triangles[:first][blocking])),
-        )
-        _set_blockers(geometry, blockers, host.triangles[:first][blocking])
+        blockers, box = kept.get("blockers", blocking.tobytes(), lambda: _blockers(launcher, host, real, blocking))
+        _set_blockers(geometry, blockers, box)
         double_sided = _both_sides(launcher, host, geometry, materials, lights)
         geometry.double_sided = launcher.array(double_sided, wp.int32)
         return DeviceScene(
@@ -270,13 +265,20 @@ def _upload_geometry(launcher: Launcher, host: _HostTriangles, real: Any, synthe
     return geometry
 
 
-def _set_blockers(geometry: Any, blockers: Any, triangles: np.ndarray) -> None:
+def _blockers(launcher: Launcher, host: _HostTriangles, real: Any, blocking: np.ndarray) -> tuple[Any, np.ndarray]:
+    """The real triangles that shadow rays ask, with their tree, and the box around them."""
+    triangles = host.triangles[: host.synthetic_first]
+    if not blocking.all():
+        triangles = triangles[blocking]
+        real = _mesh(*_mesh_arrays(launcher, triangles))
+    return real, around_runs(triangles.reshape(-1, 3), np.zeros(min(1, len(triangles)), np.int64))
+
+
+def _set_blockers(geometry: Any, blockers: Any, box: np.ndarray) -> None:
     geometry.has_blockers = int(blockers is not None)
     geometry.blockers = wp.uint64(blockers.id if blockers is not None else 0)
-    if blockers is not None:
-        box = around_runs(triangles.reshape(-1, 3), np.zeros(1, np.int64))
-        center, extent = middle_and_half(box)
-        geometry.blockers_center, geometry.blockers_extent = wp.vec3(*center[0]), wp.vec3(*extent[0])
+    for center, extent in zip(*middle_and_half(box), strict=True):
+        geometry.blockers_center, geometry.blockers_extent = wp.vec3(*center), wp.vec3(*extent)
 
 
 def _material_f0(material: Material) -> tuple[float, float, float]:

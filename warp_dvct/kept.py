@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from warp_dvct.scene import Scene
+
 Value = TypeVar("Value")
 
 
@@ -21,13 +23,20 @@ class Kept:
 
     Attributes:
         real: Key of the real scene and of volume space; every result depends on it.
+        lights: Key of each light of the frame, or none of any: a dome's texture takes long to hash, so who knows the
+            keys gives them.
         reused: Per name, whether the last request was served from what was kept.
     """
 
     def __init__(self) -> None:
         self.real = ""
+        self.lights: tuple[str, ...] = ()
         self.reused: dict[str, bool] = {}
         self._entries: dict[str, tuple[Any, Any]] = {}
+
+    def light_key(self, scene: Scene, light: int) -> str:
+        """Key of a light of the frame's scene."""
+        return self.lights[light] if self.lights else content_key(scene.lights[light])
 
     def set_real(self, key: str) -> None:
         """Say which real scene follows; another one than before frees all that was kept."""

@@ -277,7 +277,8 @@ class Relighter:
     def _device_scene(self) -> DeviceScene:
         """The scene on the device: the kept one, with the camera of this frame, where nothing else changed."""
         origin, scale = np.asarray(self.plan.origin), self.plan.scale
-        real, key = _content_keys(self._drawn, self.plan)
+        self._kept.lights = tuple(content_key(light) for light in self._drawn.lights)
+        real, key = _content_keys(self._drawn, self.plan, self._kept.lights)
         if self._uploaded is None or self._uploaded[0] != key:
             with self._launcher.scope("upload"):
                 self._uploaded = None  # free the old one first
@@ -357,7 +358,7 @@ class Relighter:
         return self._through_lens(radiance)
 
 
-def _content_keys(scene: Scene, plan: Plan) -> tuple[str, str]:
+def _content_keys(scene: Scene, plan: Plan, lights: tuple[str, ...]) -> tuple[str, str]:
     """Hashes of the real scene in volume space, and of all that uploaded data and lit volumes depend on: everything
     but camera, plate and picture size."""
     surfaces = scene.materials, scene.textures
@@ -367,7 +368,7 @@ def _content_keys(scene: Scene, plan: Plan) -> tuple[str, str]:
     passes = tuple(p.needed for p in plan.passes if p.name in ("voxelize", "pyramid", "bounces"))
     settings = replace(plan.settings, gather_rays=0, gather_object_rays=0)  # the camera's passes alone read these
     rest = (settings, plan.fine, plan.coarse, plan.start, plan.maps, passes)
-    return real, content_key(real, meshes[Role.SYNTHETIC], clouds[Role.SYNTHETIC], scene.lights, *rest)
+    return real, content_key(real, meshes[Role.SYNTHETIC], clouds[Role.SYNTHETIC], lights, *rest)
 
 
 def relight(stage: Any, *, plate: np.ndarray | None = None, ldr: bool = False, **options: Any) -> Layers:

@@ -272,7 +272,7 @@ def _inject_lights(
         with launcher.scope("rsm"):
             real = kept.get(
                 f"real map of light {entry.light}, {'fine' if fine else 'coarse'} volume",
-                content_key(scene.lights[entry.light], size, tuple(target.items())),
+                (kept.light_key(scene, entry.light), size, *target.values()),
                 lambda entry=entry, size=size, target=target: render_real(
                     launcher, device_scene, entry.light, size, **target
                 ),

@@ -81,6 +81,7 @@ def real_hull(launcher: Launcher, corners: Any, vertices: Sequence[np.ndarray], 
 def _bodies(launcher: Launcher, vertices: Sequence[np.ndarray], counts: Sequence[int]) -> Any:
     """``Bodies`` of objects by their vertices, float32 ``[v, 3]`` each, and their numbers of triangles."""
     small, large = int(kernels.SMALL), int(kernels.SMALL * kernels.IN_LARGE)
+    vertices = [v if n <= MOST_TRIANGLES else v[:1] for v, n in zip(vertices, counts, strict=True)]
     # The last vertex fills a body's last boxes.
     blocks = [np.pad(v[_along_z_curve(v)], ((0, -len(v) % large), (0, 0)), "edge") for v in vertices]
     ordered = np.concatenate([np.zeros((0, 3), np.float32), *blocks])
