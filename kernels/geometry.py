@@ -30,7 +30,7 @@ class Geometry:
     body_center: wp.array(dtype=wp.vec3)  # middle of the box around each
     body_extent: wp.array(dtype=wp.vec3)  # half its edges
     body_middle: wp.array(dtype=wp.vec3)  # mean of its vertices
-    blockers: wp.uint64  # real triangles that can lie between two points of the scene, or between one and a light
+    blockers: wp.uint64  # real triangles that can lie between a surface and a light
     has_blockers: int
     blockers_center: wp.vec3  # middle of a box that holds them
     blockers_extent: wp.vec3  # half its edges

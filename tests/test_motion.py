@@ -87,6 +87,19 @@ def test_without_a_plate_and_with_a_moving_camera():
     assert kept["real fragments, fine volume"], "the room did not"
 
 
+def test_edges_come_back_after_frames_without(plate):
+    """A budget may leave them out for a while, in which objects move."""
+    moving = relighter(scene())
+    moving.render(plate)
+    with_edges = moving.settings
+    for k, samples in enumerate((0, with_edges.antialias)):
+        moving.settings = replace(with_edges, antialias=samples)
+        moment = scene((0.03 * (k + 1), 0.02, 0.0))
+        moving.set_scene(moment)
+        frame = moving.render(plate)
+    assert same(frame, relighter(moment).render(plate))
+
+
 def test_a_moving_light_leaves_geometry_and_the_other_light():
     moving = relighter(scene())
     moving.render()

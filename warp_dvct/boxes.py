@@ -7,14 +7,14 @@ import numpy as np
 MARGIN = 1e-3  # of the largest edge: keeps rounding from culling a ray at the border, and flat boxes from being empty
 
 
-def middle_and_half(boxes: np.ndarray, margin: float = MARGIN) -> tuple[np.ndarray, np.ndarray]:
+def middle_and_half(boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Middles and half edges, ``[m, 3]`` each, of boxes a little larger than they are.
 
     Args:
-        boxes: Low and high corners of each, ``[m, 2, 3]``. margin: Share of the largest edge by which each side grows.
+        boxes: Low and high corners of each, ``[m, 2, 3]``.
     """
     low, high = boxes[:, 0], boxes[:, 1]
-    return 0.5 * (low + high), 0.5 * (high - low) + margin * (high - low).max(1, initial=0.0, keepdims=True)
+    return 0.5 * (low + high), 0.5 * (high - low) + MARGIN * (high - low).max(1, initial=0.0, keepdims=True)
 
 
 def around_runs(points: np.ndarray, starts: np.ndarray) -> np.ndarray:

@@ -134,7 +134,7 @@ def render_gbuffer(
     if edge_samples > 0:
         _mark_edges(launcher, view, width, height, window, paint)
     else:
-        view.marks = launcher.zeros(pixels, wp.int32)
+        view.marks, view.painted = launcher.zeros(pixels, wp.int32), None
     edge_rank, edge_pixel, edges = compact(launcher, view.marks)
     count = pixels + edges * edge_samples
     view.points = extended(launcher, view.points, pixels, count)
