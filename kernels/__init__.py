@@ -2,4 +2,13 @@
 
 Every file turns off the fusing of products and sums (``fuse_fp``): a GPU's compiler fuses differently in each kernel
 that a function is inlined into, so that one kernel would write more than another has counted room for.
+
+Functions take structs of arrays by value, a kilobyte or more. Compiled into their kernels that costs nothing; the calls
+that Warp's own flags leave on a CPU copy them for each ray. Files whose kernels are large set ``CPU_FLAGS``: Warp's own
+but for the sizes up to which functions are compiled in.
 """
+
+CPU_FLAGS = (
+    "-march=native -mllvm=-inline-threshold=25000 -mllvm=-inline-cold-callsite-threshold=3000"
+    " -mllvm=-slp-recursion-max-depth=4"
+)

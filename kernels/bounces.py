@@ -5,6 +5,7 @@ A patch's rays are traced once; every further bounce only follows the links from
 
 import warp as wp
 
+from warp_dvct.kernels import CPU_FLAGS
 from warp_dvct.kernels.bounce_field import (
     Bounced,
     BounceField,
@@ -35,7 +36,7 @@ from warp_dvct.kernels.radiosity import World, radiosity_at
 from warp_dvct.kernels.sampling import PI, cosine_hemisphere, from_frame, sobol2
 from warp_dvct.kernels.volume import Volume, brick_extent, face_of, face_weight, key_cell
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False, "cpu_compiler_flags": CPU_FLAGS})
 
 
 @wp.kernel
@@ -91,15 +92,18 @@ class PatchHits:
 def seen_patch(geo: Geometry, field: BounceField, head: int, guess: int, eye: wp.vec3, synthetic: int) -> int:
     """Of the patches of a role behind one face: ``guess``, or one that a free place above the point sees instead."""
     best = int(guess)
-    if not sees(geo, eye, field.patches[guess].eye):
-        searching = bool(True)
-        patch = int(head)
-        while searching and patch >= 0:
-            other = field.patches[patch]
-            if patch != guess and other.real != synthetic and sees(geo, eye, other.eye):
-                best = patch
-                searching = False
-            patch = other.next
+    candidate = int(guess)
+    rest = int(head)
+    while candidate >= 0:
+        if sees(geo, eye, field.patches[candidate].eye):
+            best = candidate
+            rest = int(-1)
+        candidate = int(-1)
+        while candidate < 0 and rest >= 0:
+            other = field.patches[rest]
+            if rest != guess and other.real != synthetic:
+                candidate = rest
+            rest = other.next
     return best
 
 
@@ -222,6 +226,7 @@ def _link_patches(
     before = wp.vec3(0.0, 0.0, 0.0)
     after = wp.vec3(0.0, 0.0, 0.0)
     width = wp.sqrt(PI / float(rays))
+    solutions = int(2)  # before and after; as a constant the loop would be unrolled
     lift = LIFT * field.volume.voxel * float(1 << field.level)
     for k in range(rays * part / parts, rays * (part + 1) / parts):
         direction = from_frame(cosine_hemisphere(sobol2(seed, index, k, 23 + face)), normal)
@@ -237,25 +242,23 @@ def _link_patches(
         triangle_out[i * rays + k] = real.triangle
         synthetic = trace_synthetic(geo, origin, direction, real.t)
         link = wp.vec2i(-1, -1)
-        if real.found != 0:
-            n = world.normals[real.triangle]
-            n = wp.where(wp.dot(n, direction) > 0.0, -n, n)
-            position = origin + direction * real.t
-            light = radiosity_at(world, position, n, width * real.t)
-            before += light.before
-            eye = origin + direction * wp.max(real.t - lift, 0.5 * real.t)
-            link[0] = patch_at(geo, field, position, n, eye, 0)
-            if synthetic.found == 0:
-                after += light.after
-                link[1] = link[0]
-        if synthetic.found != 0:
-            n = world.normals[synthetic.triangle]
-            n = wp.where(wp.dot(n, direction) > 0.0, -n, n)
-            position = origin + direction * synthetic.t
-            light = radiosity_at(world, position, n, width * synthetic.t)
-            after += light.after
-            eye = origin + direction * wp.max(synthetic.t - lift, 0.5 * synthetic.t)
-            link[1] = patch_at(geo, field, position, n, eye, 1)
+        for solution in range(solutions):
+            hit = real
+            if solution == 1:
+                hit = synthetic
+            if hit.found != 0:
+                n = world.normals[hit.triangle]
+                n = wp.where(wp.dot(n, direction) > 0.0, -n, n)
+                position = origin + direction * hit.t
+                light = radiosity_at(world, position, n, width * hit.t)
+                eye = origin + direction * wp.max(hit.t - lift, 0.5 * hit.t)
+                patch = patch_at(geo, field, position, n, eye, solution)
+                if solution == 0:
+                    before += light.before
+                    link[0] = patch
+                if solution == 1 or synthetic.found == 0:
+                    after += light.after
+                    link[1] = patch
         link_out[i * rays + k] = link
     irradiance_out[2 * i * parts + part] = before / float(rays)
     irradiance_out[(2 * i + 1) * parts + part] = after / float(rays)

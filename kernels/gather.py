@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from warp_dvct.kernels import CPU_FLAGS
 from warp_dvct.kernels.aim import NUMBERS, Targets, aim_at, ray_weight, sector_point
 from warp_dvct.kernels.environment import environment_radiance
 from warp_dvct.kernels.gbuffer import (
@@ -35,7 +36,7 @@ from warp_dvct.kernels.materials import (
 from warp_dvct.kernels.radiosity import Incident, World, radiosity_at
 from warp_dvct.kernels.sampling import INV_PI, PI, concentric_disk, from_frame, sobol2
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False, "cpu_compiler_flags": CPU_FLAGS})
 
 RUN = 32  # points
 

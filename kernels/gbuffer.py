@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_dvct.kernels import CPU_FLAGS
 from warp_dvct.kernels.geometry import (
     FAR,
     CameraFrame,
@@ -15,7 +16,7 @@ from warp_dvct.kernels.geometry import (
 from warp_dvct.kernels.materials import Materials, Surface, surface_at
 from warp_dvct.kernels.sampling import sobol2
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False, "cpu_compiler_flags": CPU_FLAGS})
 
 BACKGROUND = wp.constant(-1)
 REAL = wp.constant(0)

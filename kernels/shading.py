@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_dvct.kernels import CPU_FLAGS
 from warp_dvct.kernels.cones import ConeSettings, march_cone
 from warp_dvct.kernels.gbuffer import (
     BACKGROUND,
@@ -28,7 +29,7 @@ from warp_dvct.kernels.materials import (
 from warp_dvct.kernels.sampling import PI, sobol2, tangent_of
 from warp_dvct.kernels.volume import Volume
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False, "cpu_compiler_flags": CPU_FLAGS})
 
 UNLIT_MARGIN = wp.constant(1.0e-4)  # of a distance or cosine: keeps rounding from culling a light at the horizon
 ON_AXIS = wp.constant(1.0e-4)  # squared sine of an angle whose rounding is far below BOX_MARGIN

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_dvct.kernels import CPU_FLAGS
 from warp_dvct.kernels.bounce_field import BounceField, bounced_irradiance
 from warp_dvct.kernels.cones import ConeSettings
 from warp_dvct.kernels.environment import environment_radiance
@@ -32,7 +33,7 @@ from warp_dvct.kernels.radiosity import Incident, World
 from warp_dvct.kernels.sampling import INV_PI, sobol2
 from warp_dvct.kernels.shading import SHADOW_END, power_share, reflect_visible, vndf_pdf
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False, "cpu_compiler_flags": CPU_FLAGS})
 
 
 # A GGX alpha from which on a lobe blurs what it shows by more than the voxels do: its rays read their radiosity, but

@@ -6,6 +6,7 @@ Knecht et al. 2012, eqs. 1-8. r(p) and r(VPL) are roles, ir the flag ``hidden``,
 
 import warp as wp
 
+from warp_dvct.kernels import CPU_FLAGS
 from warp_dvct.kernels.environment import Environment, environment_radiance
 from warp_dvct.kernels.gather import inverse_distance
 from warp_dvct.kernels.gbuffer import BACKGROUND, REAL, SYNTHETIC, Points, load_surface
@@ -30,7 +31,7 @@ from warp_dvct.kernels.shading import SHADOW_END, Direct, look, reflect_visible,
 from warp_dvct.kernels.specular import Glossy, lights_along
 from warp_dvct.kernels.vpls import SKY, Vpls
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False, "cpu_compiler_flags": CPU_FLAGS})
 
 NEAREST = wp.constant(1.0e-12)  # squared distance below which a VPL and a point are one
 TOO_FEW = wp.constant(0.7)  # share of the interleaved sets that a point needs from its neighbours

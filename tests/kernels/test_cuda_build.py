@@ -114,8 +114,9 @@ def test_file_sets_module_options_before_anything_else(file):
     body = [node for node in ast.parse(file.read_text()).body if not isinstance(node, ast.Import | ast.ImportFrom)]
     if ast.get_docstring(ast.parse(file.read_text())) is not None:
         body = body[1:]
-    options = f"{{'enable_backward': {file.stem in DIFFERENTIATED}, 'fuse_fp': False}}"
-    assert ast.unparse(body[0]) == f"wp.set_module_options({options})"
+    options = f"'enable_backward': {file.stem in DIFFERENTIATED}, 'fuse_fp': False"
+    flags = ", 'cpu_compiler_flags': CPU_FLAGS" if "CPU_FLAGS" in file.read_text() else ""
+    assert ast.unparse(body[0]) == f"wp.set_module_options({{{options}{flags}}})"
 
 
 @pytest.mark.parametrize("name", MODULES)
