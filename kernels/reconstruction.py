@@ -9,15 +9,22 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.struct
+class Spot:
+    """A gathered point, in one piece: every pixel asks those of the blocks around it."""
+
+    position: wp.vec3
+    normal_g: wp.vec3
+    normal: wp.vec3
+    center: wp.vec2  # of its pixel, in pixels
+    triangle: wp.int32
+
+
+@wp.struct
 class Gathered:
-    """The gathered point of each block of the picture, packed: every pixel asks those of the blocks around it."""
+    """The gathered point of each block of the picture."""
 
     choice: wp.array(dtype=wp.int32)  # [columns * rows], the point, or -1
-    center: wp.array(dtype=wp.vec2)  # of its pixel, in pixels
-    triangle: wp.array(dtype=wp.int32)
-    position: wp.array(dtype=wp.vec3)
-    normal_g: wp.array(dtype=wp.vec3)
-    normal: wp.array(dtype=wp.vec3)
+    spot: wp.array(dtype=Spot)
 
 
 @wp.kernel
@@ -54,11 +61,13 @@ def _choose_points(
         tried += 1
     gathered_out.choice[i] = found
     if found >= 0:
-        gathered_out.center[i] = wp.vec2(float(found % width) + 0.5, float(found / width) + 0.5)
-        gathered_out.triangle[i] = points.triangle[found]
-        gathered_out.position[i] = points.position[found]
-        gathered_out.normal_g[i] = points.normal_g[found]
-        gathered_out.normal[i] = points.normal[found]
+        spot = Spot()
+        spot.position = points.position[found]
+        spot.normal_g = points.normal_g[found]
+        spot.normal = points.normal[found]
+        spot.center = wp.vec2(float(found % width) + 0.5, float(found / width) + 0.5)
+        spot.triangle = points.triangle[found]
+        gathered_out.spot[i] = spot
 
 
 @wp.struct
@@ -88,20 +97,17 @@ def same_surface(
     normal_g: wp.vec3,
     normal: wp.vec3,
     tolerance: float,
-    gathered: Gathered,
-    block: int,
+    spot: Spot,
 ) -> float:
     """Weight in [0, 1] by how well two points lie in each other's tangent plane and face the same way; ``tolerance`` is
     the distance off the plane at which they hardly count. Points of one triangle lie in its plane."""
-    facing = wp.dot(normal, gathered.normal[block])
-    if facing <= 0.0:
-        return 0.0
+    facing = wp.max(wp.dot(normal, spot.normal), 0.0)
     square = facing * facing
     fourth = square * square
-    if gathered.triangle[block] == triangle:
+    if spot.triangle == triangle:
         return fourth * fourth
-    offset = gathered.position[block] - position
-    gap = wp.max(wp.abs(wp.dot(offset, normal_g)), wp.abs(wp.dot(offset, gathered.normal_g[block]))) / tolerance
+    offset = spot.position - position
+    gap = wp.max(wp.abs(wp.dot(offset, normal_g)), wp.abs(wp.dot(offset, spot.normal_g))) / tolerance
     return fourth * fourth * falloff(gap * gap)
 
 
@@ -130,10 +136,7 @@ def _smooth(
     if at >= 0 and mark_in[i] != 0:
         cx = i % guide.columns
         cy = i / guide.columns
-        position = gathered.position[i]
-        normal = gathered.normal[i]
-        normal_g = gathered.normal_g[i]
-        triangle = gathered.triangle[i]
+        own = gathered.spot[i]
         tolerance = guide.plane * float(guide.stride) * points.footprint[at]
         for dy in range(-guide.radius, guide.radius + 1):
             for dx in range(-guide.radius, guide.radius + 1):
@@ -142,15 +145,16 @@ def _smooth(
                 if (dx != 0 or dy != 0) and bx >= 0 and by >= 0 and bx < guide.columns and by < guide.rows:
                     block = by * guide.columns + bx
                     if gathered.choice[block] >= 0:
+                        spot = gathered.spot[block]
                         # Both must see far: a smooth point does not smooth one at a contact.
                         inverse = wp.max(nearness_in[i], nearness_in[block]) / guide.reach
-                        apart = wp.length_sq(gathered.position[block] - position) * inverse * inverse
+                        apart = wp.length_sq(spot.position - own.position) * inverse * inverse
                         weight = falloff(apart)
-                        weight *= same_surface(triangle, position, normal_g, normal, tolerance, gathered, block)
-                        if weight > 1.0e-3:
-                            total += weight
-                            before += before_in[block] * weight
-                            after += after_in[block] * weight
+                        weight *= same_surface(own.triangle, own.position, own.normal_g, own.normal, tolerance, spot)
+                        weight = wp.where(weight > 1.0e-3, weight, 0.0)
+                        total += weight
+                        before += before_in[block] * weight
+                        after += after_in[block] * weight
     before_out[i] = before / total
     after_out[i] = after / total
 
@@ -191,16 +195,16 @@ def interpolated(
         for bx in range(wp.max(cx - guide.radius, 0), wp.min(cx + guide.radius, guide.columns - 1) + 1):
             block = by * guide.columns + bx
             if gathered.choice[block] >= 0:
-                dx = gathered.center[block][0] - px
-                dy = gathered.center[block][1] - py
+                spot = gathered.spot[block]
+                dx = spot.center[0] - px
+                dy = spot.center[1] - py
                 near = wp.max(0.0, 1.0 - (dx * dx + dy * dy) * scale)
-                if near > 0.0:
-                    same = same_surface(triangle, position, normal_g, normal, tolerance, gathered, block)
-                    weight = near * near * same
-                    if weight > 1.0e-4:
-                        total += weight
-                        before += before_in[block] * weight
-                        after += after_in[block] * weight
+                weight = near * near * same_surface(triangle, position, normal_g, normal, tolerance, spot)
+                # Added without a branch: no processor can foresee which blocks count.
+                weight = wp.where(weight > 1.0e-4, weight, 0.0)
+                total += weight
+                before += before_in[block] * weight
+                after += after_in[block] * weight
     if total > 1.0e-3:
         result.before = before / total
         result.after = after / total
@@ -240,8 +244,10 @@ def _find_detail(
     if j >= 0:
         block = ((i / fine_columns) / 2) * guide.columns + (i % fine_columns) / 2
         half = 0.5 * float(guide.stride) * points.footprint[j]
-        way = wp.max(wp.length(fine.position[i] - gathered.position[block]), half) * nearness_in[block]
-        turn = wp.sqrt(wp.max(1.0 - wp.dot(fine.normal[i], gathered.normal[block]), 0.0))
+        spot = fine.spot[i]
+        around = gathered.spot[block]
+        way = wp.max(wp.length(spot.position - around.position), half) * nearness_in[block]
+        turn = wp.sqrt(wp.max(1.0 - wp.dot(spot.normal, around.normal), 0.0))
         found = interpolated(points, j, guide, gathered, before_in, after_in)
         nearness_out[i] = nearness_in[block]
         before_out[i] = found.before

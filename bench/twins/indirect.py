@@ -327,10 +327,10 @@ def measure_reconstruction(launcher: Any) -> list[Deviation]:
     mark = rng.integers(0, 4, count) > 0
     gathered = reconstruction.Gathered()
     gathered.choice = launcher.array(np.arange(count, dtype=np.int32), wp.int32)
-    gathered.center = launcher.zeros(count, wp.vec2)
     triangle = np.arange(count) // 2
-    gathered.triangle = launcher.array(triangle.astype(np.int32), wp.int32)
-    gathered.position, gathered.normal, gathered.normal_g = points.position, points.normal, points.normal_g
+    spots: Any = np.zeros(count, reconstruction.Spot.numpy_dtype())
+    spots["position"], spots["normal"], spots["normal_g"], spots["triangle"] = place, normal, normal, triangle
+    gathered.spot = launcher.array(spots, reconstruction.Spot)
     light, nearness = rng.uniform(0, 3, (count, 3)), rng.uniform(0.3, 2.0, count)
     given = [launcher.array(light.astype(np.float32), wp.vec3)] * 2
     near = launcher.array(nearness.astype(np.float32), wp.float32)

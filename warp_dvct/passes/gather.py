@@ -276,9 +276,7 @@ class SparseGather:
         launcher, buffer, count = self.launcher, self.buffer, columns * rows
         gathered = reconstruction.Gathered()
         gathered.choice = launcher.empty(count, wp.int32)
-        gathered.center = launcher.empty(count, wp.vec2)
-        gathered.triangle = launcher.empty(count, wp.int32)
-        gathered.position, gathered.normal_g, gathered.normal = (launcher.empty(count, wp.vec3) for _ in range(3))
+        gathered.spot = launcher.empty(count, reconstruction.Spot)
         window = buffer.window if self.role == Role.SYNTHETIC else (0, buffer.width - 1, 0, buffer.height - 1)
         how = [stride, columns, wp.vec4i(*window), int(self.role), self.gatherer.seed]
         launcher.launch(
