@@ -208,11 +208,13 @@ def _see_synthetic(
     window: wp.vec4i,
     width: int,
     height: int,
+    first_pixel: int,
     points_out: Points,
 ):
     """Put synthetic surfaces in front of what ``points_out`` holds of the real scene, once those of the frame before
-    are taken out. None is seen outside of ``window``: its first and last column, first and last row."""
-    i = first + wp.tid()
+    are taken out; for pixels from ``first_pixel`` on. None is seen outside of ``window``: its first and last column,
+    first and last row."""
+    i = first + wp.tid() + first_pixel
     points_out.slot[i] = WHOLE
     x = i % width
     y = i / width
@@ -298,14 +300,16 @@ def _see_edges(
     mats: Materials,
     cam: CameraFrame,
     pixel_in: wp.array(dtype=wp.int32),
+    kept: int,
     width: int,
     height: int,
     samples: int,
     seed: int,
     points_out: Points,
 ):
-    """Sub-pixel points of the edge pixels, spread over the pixel's area; they follow the centres in ``points_out``."""
-    i = first + wp.tid()
+    """Sub-pixel points of the edge pixels, spread over the pixel's area; they follow the centres in ``points_out``,
+    which holds those of the first ``kept`` edge pixels."""
+    i = first + wp.tid() + kept * samples
     pixel = pixel_in[i / samples]
     xi = sobol2(seed, pixel, i % samples, 0)
     px = float(pixel % width) + xi[0]

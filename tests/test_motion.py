@@ -12,6 +12,8 @@ from warp_dvct.bench.motion import MotionOptions, flicker_of, format_report, mea
 from warp_dvct.errors import OptionError
 from warp_dvct.frame import volume_frame
 from warp_dvct.kept import Kept
+from warp_dvct.kernels import gbuffer
+from warp_dvct.launch import Launcher
 from warp_dvct.relighter import Relighter
 from warp_dvct.scene import Camera, Light, LightKind, LightRole, Material, Role
 
@@ -87,17 +89,37 @@ def test_without_a_plate_and_with_a_moving_camera():
     assert kept["real fragments, fine volume"], "the room did not"
 
 
-def test_edges_come_back_after_frames_without(plate):
+@pytest.mark.parametrize("other", [{"antialias": 0}, {"antialias": 2}, {"seed": 5}], ids=str)
+def test_edges_come_back_after_frames_with_others(plate, other):
     """A budget may leave them out for a while, in which objects move."""
     moving = relighter(scene())
     moving.render(plate)
-    with_edges = moving.settings
-    for k, samples in enumerate((0, with_edges.antialias)):
-        moving.settings = replace(with_edges, antialias=samples)
+    settings = moving.settings
+    for k, changed in enumerate((other, {})):
+        moving.settings = replace(settings, **changed)
         moment = scene((0.03 * (k + 1), 0.02, 0.0))
         moving.set_scene(moment)
         frame = moving.render(plate)
     assert same(frame, relighter(moment).render(plate))
+
+
+def test_edges_above_the_objects_are_not_traced_again(plate, monkeypatch):
+    traced = []
+    launch = Launcher.launch
+
+    def count(launcher, kernel, elements, *arrays):
+        if kernel is gbuffer._see_edges:
+            traced.append(elements)
+        return launch(launcher, kernel, elements, *arrays)
+
+    monkeypatch.setattr(Launcher, "launch", count)
+    moving = relighter(scene())
+    for k in range(2):
+        moment = scene((0.004 * k, 0.0, 0.0))
+        moving.set_scene(moment)
+        frame = moving.render(plate)
+    assert same(frame, relighter(moment).render(plate))
+    assert 0 < traced[1] < traced[2]
 
 
 def test_a_moving_light_leaves_geometry_and_the_other_light():

@@ -50,14 +50,16 @@ class GBuffer:
 
 @dataclass
 class View:
-    """What one camera sees at its pixels' centres, from frame to frame of a shot.
+    """What one camera sees, from frame to frame of a shot.
 
     Attributes:
         points: ``Points``, entry ``p`` is pixel ``p``: of the real scene alone at first, then with the last frame's
-            objects in it, which the next frame takes out again. What lies behind pixels is room for edge points.
+            objects in it, which the next frame takes out again. Behind pixels are the last frame's edge points, and
+            room for more.
         reach: float ``[pixels]``, where rays into the real scene end.
         marks: int ``[pixels]``, the last frame's edge pixels. painted: Whether colours made edges then; None before.
         rows: First and last row that the objects of the last frame may have reached.
+        edges: Points an edge pixel had, and the seed of where they were; None before.
     """
 
     points: Any
@@ -65,6 +67,7 @@ class View:
     marks: Any = None
     painted: bool | None = None
     rows: tuple[int, int] = (0, -1)
+    edges: tuple[int, int] | None = None
 
 
 def see_real(launcher: Launcher, scene: DeviceScene, width: int, height: int, *, edge_room: int = 0) -> View:
@@ -129,37 +132,41 @@ def render_gbuffer(
     shared = [scene.geometry, scene.materials, scene.camera]
     view = view or new_view(launcher, scene, width, height, edge_samples)
     window = objects_window(scene, width, height)
-    inputs = [*shared, view.reach, wp.vec4i(*window), width, height]
-    launcher.launch(kernels._see_synthetic, pixels, inputs, [view.points])
+    low, high = _changed_rows(view, height, window, paint if edge_samples > 0 else None)
+    changed, start = (high - low + 1) * width, low * width
+    inputs = [*shared, view.reach, wp.vec4i(*window), width, height, start]
+    launcher.launch(kernels._see_synthetic, changed, inputs, [view.points])
+    if view.marks is None:
+        view.marks = launcher.zeros(pixels, wp.int32)
     if edge_samples > 0:
-        _mark_edges(launcher, view, width, height, window, paint)
+        launcher.launch(kernels._mark_edges, changed, [view.points, width, height, int(paint), start], [view.marks])
     else:
-        view.marks, view.painted = launcher.zeros(pixels, wp.int32), None
+        view.marks.zero_()
     edge_rank, edge_pixel, edges = compact(launcher, view.marks)
+    # Points of the edges above those rows are where they were: they come first in both frames.
+    same = view.edges == (edge_samples, seed)
+    kept = int(np.searchsorted(edge_pixel.numpy()[:edges], start)) if same else 0
+    view.edges = edge_samples, seed
     count = pixels + edges * edge_samples
-    view.points = extended(launcher, view.points, pixels, count)
+    view.points = extended(launcher, view.points, pixels + kept * edge_samples, count)
     points = first_points(view.points, count)
-    launcher.launch(
-        kernels._see_edges, edges * edge_samples, [*shared, edge_pixel, width, height, edge_samples, seed], [points]
-    )
+    how = [edge_pixel, kept, width, height, edge_samples, seed]
+    launcher.launch(kernels._see_edges, (edges - kept) * edge_samples, [*shared, *how], [points])
     hidden: tuple[Any, Any, Any, int] = (None, None, None, 0)
     if behind:
         hidden = _look_behind(launcher, scene, points, count, width)
     return GBuffer(width, height, edge_samples, points, count, window, edge_rank, edge_pixel, *hidden)
 
 
-def _mark_edges(
-    launcher: Launcher, view: View, width: int, height: int, window: tuple[int, int, int, int], paint: bool
-) -> None:
-    """Mark the edge pixels of a view; anew only beside rows in which objects are, or were in the last frame."""
+def _changed_rows(view: View, height: int, window: tuple[int, int, int, int], painted: bool | None) -> tuple[int, int]:
+    """First and last row in which objects or edges may have changed: those in which objects are, or were in the last
+    frame, and those beside; all where edges were marked by other rules than ``painted``, which is None for no edges."""
     rows = (window[2], window[3]) if window[0] <= window[1] else (height, -1)
     low, high = max(min(rows[0], view.rows[0]) - 1, 0), min(max(rows[1], view.rows[1]) + 1, height - 1)
-    if view.painted != paint:
-        view.marks = launcher.empty(width * height, wp.int32)
+    if painted is None or view.painted != painted:
         low, high = 0, height - 1
-    inputs = [view.points, width, height, int(paint), low * width]
-    launcher.launch(kernels._mark_edges, (high - low + 1) * width, inputs, [view.marks])
-    view.painted, view.rows = paint, rows
+    view.painted, view.rows = painted, rows
+    return low, high
 
 
 def compact(launcher: Launcher, mark: Any) -> tuple[Any, Any, int]:
