@@ -2,7 +2,15 @@
 
 import warp as wp
 
-from warp_dvct.kernels.volume import Volume, between_voxels, corner_step, corner_weight, face_of, find_record
+from warp_dvct.kernels.volume import (
+    Volume,
+    between_voxels,
+    corner_step,
+    corner_weight,
+    face_of,
+    field_slot,
+    find_record,
+)
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -42,9 +50,9 @@ def sample_volume(volume: Volume, level: int, position: wp.vec3, direction: wp.v
     """
     size = volume.voxel * float(1 << level)
     at = between_voxels(volume, level, position)
-    face_x = 2 * face_of(0, -direction[0])
-    face_y = 2 * face_of(1, -direction[1])
-    face_z = 2 * face_of(2, -direction[2])
+    face_x = face_of(0, -direction[0])
+    face_y = face_of(1, -direction[1])
+    face_z = face_of(2, -direction[2])
     wx = wp.abs(direction[0])
     wy = wp.abs(direction[1])
     wz = wp.abs(direction[2])
@@ -70,16 +78,16 @@ def sample_volume(volume: Volume, level: int, position: wp.vec3, direction: wp.v
                     for axis in range(3):
                         if direction[axis] * plane[axis] > 0.0:
                             share[axis] = 0.0
-            first = record * 12
+            slot_x = field_slot(volume, record, face_x)
+            slot_y = field_slot(volume, record, face_y)
+            slot_z = field_slot(volume, record, face_z)
             result.before += weight * (
-                share[0] * volume.field[first + face_x]
-                + share[1] * volume.field[first + face_y]
-                + share[2] * volume.field[first + face_z]
+                share[0] * volume.field[slot_x] + share[1] * volume.field[slot_y] + share[2] * volume.field[slot_z]
             )
             result.after += weight * (
-                share[0] * volume.field[first + face_x + 1]
-                + share[1] * volume.field[first + face_y + 1]
-                + share[2] * volume.field[first + face_z + 1]
+                share[0] * volume.field[slot_x + 1]
+                + share[1] * volume.field[slot_y + 1]
+                + share[2] * volume.field[slot_z + 1]
             )
     return result
 

@@ -5,6 +5,7 @@ import warp as wp
 from warp_dvct.kernels.volume import (
     Volume,
     brick_extent,
+    field_slot,
     find_record,
     key_cell,
 )
@@ -28,6 +29,7 @@ def radiosity_face(flux: wp.vec3, area: float) -> wp.vec4:
 @wp.kernel
 def _light_faces(
     first: int,
+    volume: Volume,
     area_in: wp.array(dtype=wp.vec2),
     flux_in: wp.array(dtype=wp.vec3),
     mode: int,
@@ -47,20 +49,21 @@ def _light_faces(
             if area > 0.0:
                 value = wp.vec4(flux[0] / area, flux[1] / area, flux[2] / area, 1.0)
             for face in range(6):
-                field_out[(i * 6 + face) * 2 + solution] = value
+                field_out[field_slot(volume, i, face) + solution] = value
     else:
         for face in range(6):
             shown = area_in[i * 6 + face]
-            field_out[(i * 6 + face) * 2] = radiosity_face(flux_in[(i * 6 + face) * 2], shown[0])
-            field_out[(i * 6 + face) * 2 + 1] = radiosity_face(flux_in[(i * 6 + face) * 2 + 1], shown[1])
+            slot = field_slot(volume, i, face)
+            field_out[slot] = radiosity_face(flux_in[(i * 6 + face) * 2], shown[0])
+            field_out[slot + 1] = radiosity_face(flux_in[(i * 6 + face) * 2 + 1], shown[1])
 
 
 @wp.func
-def child_value(volume: Volume, level: int, x: int, y: int, z: int, slot: int) -> wp.vec4:
+def child_value(volume: Volume, level: int, x: int, y: int, z: int, face: int, solution: int) -> wp.vec4:
     record = find_record(volume, level, x, y, z)
     if record < 0:
         return wp.vec4(0.0, 0.0, 0.0, 0.0)
-    return volume.field[record * 12 + slot]
+    return volume.field[field_slot(volume, record, face) + solution]
 
 
 @wp.func
@@ -94,15 +97,16 @@ def _filter_level(
     y = 2 * cell[1]
     z = 2 * cell[2]
     below = level - 1
-    for slot in range(12):
-        face = slot / 2
+    for k in range(12):
+        face = k / 2
+        solution = k % 2
         axis = face / 2
         total = wp.vec4(0.0, 0.0, 0.0, 0.0)
         if mode == ISOTROPIC:
             for child in range(8):
-                total += (
-                    child_value(volume, below, x + (child & 1), y + ((child >> 1) & 1), z + (child >> 2), slot) * 0.125
-                )
+                cx = x + (child & 1)
+                cy = y + ((child >> 1) & 1)
+                total += child_value(volume, below, cx, cy, z + (child >> 2), face, solution) * 0.125
         else:
             near = wp.where((face & 1) == 0, 1, 0)
             for pair in range(4):
@@ -115,7 +119,7 @@ def _filter_level(
                 bx = ax + wp.where(axis == 0, flip, 0)
                 by = ay + wp.where(axis == 1, flip, 0)
                 bz = az + wp.where(axis == 2, flip, 0)
-                front = child_value(volume, below, ax, ay, az, slot)
-                back = child_value(volume, below, bx, by, bz, slot)
+                front = child_value(volume, below, ax, ay, az, face, solution)
+                back = child_value(volume, below, bx, by, bz, face, solution)
                 total += composite_pair(front, back) * 0.25
-        field_out[(record_start + i) * 12 + slot] = total
+        field_out[field_slot(volume, record_start + i, face) + solution] = total

@@ -3,7 +3,15 @@
 import warp as wp
 
 from warp_dvct.kernels.environment import Environment
-from warp_dvct.kernels.volume import Volume, between_voxels, corner_step, corner_weight, face_of, find_record
+from warp_dvct.kernels.volume import (
+    Volume,
+    between_voxels,
+    corner_step,
+    corner_weight,
+    face_of,
+    field_slot,
+    find_record,
+)
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -57,9 +65,9 @@ def field_pair(volume: Volume, position: wp.vec3, normal: wp.vec3) -> FieldPair:
             for axis in range(3):
                 share = wp.abs(normal[axis])
                 if share > 0.01:
-                    face = record * 12 + 2 * face_of(axis, normal[axis])
-                    total.before += (weight * share) * volume.field[face]
-                    total.after += (weight * share) * volume.field[face + 1]
+                    slot = field_slot(volume, record, face_of(axis, normal[axis]))
+                    total.before += (weight * share) * volume.field[slot]
+                    total.after += (weight * share) * volume.field[slot + 1]
     return total
 
 
@@ -82,9 +90,9 @@ def voxel_pair(volume: Volume, position: wp.vec3, normal: wp.vec3) -> FieldPair:
         for axis in range(3):
             share = wp.abs(normal[axis])
             if share > 0.1:
-                at = record * 12 + 2 * face_of(axis, normal[axis])
-                total.before += share * volume.field[at]
-                total.after += share * volume.field[at + 1]
+                slot = field_slot(volume, record, face_of(axis, normal[axis]))
+                total.before += share * volume.field[slot]
+                total.after += share * volume.field[slot + 1]
     return total
 
 

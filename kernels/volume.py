@@ -3,7 +3,8 @@
 A level of ``n`` voxels an edge is a table of bricks of 8^3 cells; a cell holds the index of a *record* or -1, so memory
 follows occupied voxels. A record has six faces, one per outward axis direction (+x, -x, +y, -y, +z, -z). A face holds
 two solutions, before (real surfaces) and after (all surfaces), each as (radiosity * alpha, alpha), where alpha is the
-front-facing area projected onto the face over the face's area, clamped to 1.
+front-facing area projected onto the face over the face's area, clamped to 1. All records' faces of one direction lie
+together: most surfaces show on one, and those of neighbours then share what a cache fetches.
 """
 
 import warp as wp
@@ -22,10 +23,11 @@ class Volume:
     voxel: wp.float32  # edge of a level-0 voxel
     n: wp.int32  # level-0 voxels an edge
     levels: wp.int32
+    records: wp.int32  # of all levels
     table_start: wp.array(dtype=wp.int32)  # [levels], where a level's brick table begins
     tables: wp.array(dtype=wp.int32)  # brick index or -1
     cells: wp.array(dtype=wp.int32)  # [bricks * 512], record index or -1
-    field: wp.array(dtype=wp.vec4)  # [records * 12], (record * 6 + face) * 2 + solution
+    field: wp.array(dtype=wp.vec4)  # [6 * records * 2], ``field_slot`` + solution
 
 
 @wp.func
@@ -74,6 +76,12 @@ def find_record(volume: Volume, level: int, x: int, y: int, z: int) -> int:
 def face_of(axis: int, direction: float) -> int:
     """Face whose outward normal is along ``axis`` with the sign of ``direction``."""
     return wp.where(direction >= 0.0, 2 * axis, 2 * axis + 1)
+
+
+@wp.func
+def field_slot(volume: Volume, record: int, face: int) -> int:
+    """Where the two solutions of a record's face are in the field."""
+    return 2 * (face * volume.records + record)
 
 
 @wp.func

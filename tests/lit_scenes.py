@@ -167,8 +167,7 @@ def dense(voxels: Voxels, values: np.ndarray, level: int = 0) -> np.ndarray:
 
 def field_of(voxels: Voxels, level: int) -> np.ndarray:
     """A level's field as a dense grid: ``[x, y, z, face, solution, 4]``."""
-    field = voxels.volume.field.numpy().reshape(-1, 6, 2, 4).astype(float)
-    return dense(voxels, field, level)
+    return dense(voxels, voxels.field().astype(float), level)
 
 
 def launcher_vectors(launcher: Launcher, values: np.ndarray) -> Any:

@@ -177,7 +177,7 @@ def _light(volumes: Sequence[Voxels]) -> float:
     total = 0.0
     for voxels in volumes:
         count = voxels.level_records[0]
-        field = voxels.volume.field.numpy()[: 12 * count].reshape(count, 6, 2, 4)
+        field = voxels.field()[:count]
         total += float(field[:, :, 1, :3].sum(dtype=np.float64)) * voxels.box.voxel**2
     return total
 

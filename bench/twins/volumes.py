@@ -52,7 +52,7 @@ def dense(voxels: Voxels, values: np.ndarray, level: int = 0) -> np.ndarray:
 
 def fields(voxels: Voxels) -> list[np.ndarray]:
     """The field of each level on a grid: ``[x, y, z, face, solution, 4]``."""
-    values = voxels.volume.field.numpy().astype(np.float64).reshape(-1, 6, 2, 4)
+    values = voxels.field().astype(np.float64)
     starts = np.cumsum([0, *voxels.level_records])
     return [dense(voxels, values[starts[k] : starts[k + 1]], k) for k in range(len(voxels.level_records))]
 

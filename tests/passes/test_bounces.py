@@ -53,7 +53,7 @@ class Solver:
         device_scene = self.lit.device_scene
         reinject(self.launcher, device_scene, self.normals, self.voxels, albedo, self.flux, self.patches, total)
         light_faces(self.launcher, self.voxels, self.flux)
-        field = self.voxels.volume.field.numpy().reshape(-1, 6, 2, 4)[: self.voxels.level_records[0]].astype(float)
+        field = self.voxels.field()[: self.voxels.level_records[0]].astype(float)
         with np.errstate(divide="ignore", invalid="ignore"):
             return field[..., :3] / field[..., 3:]
 

@@ -77,7 +77,7 @@ def test_radiosity_of_slanted_surfaces_is_the_same_on_each_face(launcher):
     )
     voxels, _, flux = injected(launcher, lit.scene_of(lit.mesh(plate), lights=(sun,)), 12, 1024)
     light_faces(launcher, voxels, flux)
-    field = voxels.volume.field.numpy().reshape(-1, 6, 2, 4)[: voxels.level_records[0], :, 1].astype(float)
+    field = voxels.field()[: voxels.level_records[0], :, 1].astype(float)
     area = lit.areas(voxels)[..., 1]
     shown = area > 0.1
     assert sorted(np.unique(np.argwhere(shown)[:, 1])) == sorted(np.flatnonzero(FACES @ normal > 0.1))

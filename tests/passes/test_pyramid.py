@@ -129,7 +129,7 @@ def test_all_levels_of_a_random_field_match_numpy(launcher, filter, twin, n):
     field = np.zeros((sum(voxels.level_records), 6, 2, 4), np.float32)
     alpha = rng.uniform(0, 1, (level0, 6, 2, 1)) * rng.choice([0, 1], (level0, 6, 2, 1))
     field[:level0] = np.concatenate([alpha * rng.lognormal(0, 1, (level0, 6, 2, 3)), alpha], -1)
-    voxels.volume.field.assign(field.reshape(-1, 4))
+    voxels.volume.field.assign(field.swapaxes(0, 1).reshape(-1, 4))
     build_pyramid(launcher, voxels, filter=filter)
     expected = lit.field_of(voxels, 0)
     assert len(voxels.level_records) == 4 + (n > 8)

@@ -251,7 +251,7 @@ def _world(launcher: Launcher, scene: Scene, normals: Any, volumes: list[Voxels]
 def _no_volume(launcher: Launcher) -> Any:
     """A volume of one empty voxel, for kernels that take one and will find nothing in it."""
     volume = Volume()
-    volume.low, volume.voxel, volume.n, volume.levels = wp.vec3(0.0, 0.0, 0.0), 1.0, 1, 1
+    volume.low, volume.voxel, volume.n, volume.levels, volume.records = wp.vec3(0.0, 0.0, 0.0), 1.0, 1, 1, 1
     volume.table_start = launcher.zeros(1, wp.int32)
     volume.tables = launcher.full(1, -1, wp.int32)
     volume.cells = launcher.full(1, -1, wp.int32)

@@ -21,7 +21,7 @@ def light_faces(launcher: Launcher, voxels: Voxels, flux: Any, *, filter: str = 
     launcher.launch(
         kernels._light_faces,
         voxels.level_records[0],
-        [voxels.area, flux, _mode(filter)],
+        [voxels.volume, voxels.area, flux, _mode(filter)],
         [voxels.volume.field],
     )
 

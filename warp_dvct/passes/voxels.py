@@ -72,6 +72,10 @@ class Voxels:
     area: Any
     fragments: Fragments
 
+    def field(self) -> np.ndarray:
+        """The field of all levels on the host, ``[records, face, solution, 4]``."""
+        return self.volume.field.numpy().reshape(6, -1, 2, 4).swapaxes(0, 1)
+
 
 @dataclass(frozen=True)
 class Pieces:
@@ -226,8 +230,9 @@ def _build_maps(launcher: Launcher, level_keys: list[Any], box: Box) -> Any:
     volume.voxel = box.voxel
     volume.n = box.n
     volume.levels = len(level_keys)
+    volume.records = max(1, records)
     volume.table_start = launcher.array(table_start[:-1].copy(), wp.int32)
     volume.tables = tables
     volume.cells = cells
-    volume.field = launcher.zeros(max(1, records * 12), wp.vec4)
+    volume.field = launcher.zeros(12 * volume.records, wp.vec4)
     return volume
