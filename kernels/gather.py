@@ -82,10 +82,12 @@ def ray_incident(world: World, geo: Geometry, origin: wp.vec3, direction: wp.vec
 class KeptRays:
     """What the rays of gather points met in the real scene, from frame to frame of a shot.
 
-    A slot holds one point's rays; it is refilled whenever its point is another one.
+    Each block of ``stride`` x ``stride`` pixels has a slot for its point's rays, which is refilled whenever that point
+    is another one.
     """
 
-    present: wp.int32  # 0: nothing is kept, the arrays are empty
+    slots: wp.int32  # 0: nothing is kept, the arrays are empty
+    columns: wp.int32  # blocks in a row of the picture
     point: wp.array(dtype=wp.int32)  # [slots * parts], -1 at first
     count: wp.array(dtype=wp.int32)  # [slots * parts], how many of its rays are kept
     reach: wp.array(dtype=wp.float32)  # [slots * rays], hit distance
@@ -215,7 +217,6 @@ def gather_at(
     ``hits``: ``GlossyHits`` or ``Lambertian``.
     """
     total = Gathered()
-    slot = part[0] * part[2] + part[1]
     s = load_surface(points, j)
     body = body_left(geo, s)
     even = share_of(rays, points, j, edge_samples)
@@ -224,7 +225,10 @@ def gather_at(
     if aim.rays > 0:
         even = few
     known = False
-    if kept_out.present != 0:
+    place = int(0)
+    if kept_out.slots != 0:
+        place = (points.pixel[j][1] / stride) * kept_out.columns + points.pixel[j][0] / stride
+        slot = place * part[2] + part[1]
         # As many even rays as before are the same rays: their numbers start by how many there are.
         known = kept_out.point[slot] == j and kept_out.count[slot] == even
         kept_out.point[slot] = j
@@ -243,8 +247,8 @@ def gather_at(
         weight = ray_weight(aim, even, disk, drawn)
         ray = ray_over(s, disk, weight)
         if ray.up != 0:
-            keeps = kept_out.present != 0 and k < even
-            at = part[0] * rays + k
+            keeps = kept_out.slots != 0 and k < even
+            at = place * rays + k
             ray.real = kept_real(kept_out, keeps, keeps and known, at, geo, ray.origin, ray.direction)
             ray.synthetic = no_hit(ray.real.t)
             if not clear_of_objects(geo, body, s.normal_g, ray.origin, ray.direction, ray.real.t):

@@ -153,7 +153,7 @@ def test_aimed_points_are_those_of_a_frame(surveys, monkeypatch, stage):
 
     def watching(self, launcher, points, index, count, nearness=None, kept=None, **kwargs):
         result = run(self, launcher, points, index, count, nearness, kept, **kwargs)
-        if kept is not None:
+        if kept is not None and kwargs["part"] == gather.REAL_PARTS[0]:
             filled = kept.point.numpy() >= 0
             shares.append(float((kept.count.numpy()[filled] < self.rays).mean()))
             place, normal = (a.numpy()[kept.point.numpy()[filled]] for a in (points.position, points.normal))

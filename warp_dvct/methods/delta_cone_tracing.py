@@ -28,6 +28,7 @@ from warp_dvct.passes.bounces import mean_albedo, reinject, solve_bounces
 from warp_dvct.passes.environment import build_environment
 from warp_dvct.passes.gather import (
     HIDDEN,
+    REAL_PARTS,
     Gatherer,
     SparseGather,
     Turns,
@@ -35,7 +36,9 @@ from warp_dvct.passes.gather import (
     gather_all,
     glossy_hits,
     keep_rays,
+    rays_of,
     shade_indirect,
+    strides,
 )
 from warp_dvct.passes.gbuffer import GBuffer, new_view, render_gbuffer
 from warp_dvct.passes.injection import empty_flux, inject
@@ -159,7 +162,7 @@ def render(
     light_field = _shade_direct(launcher, device_scene, plan, lit, parts)
     world = light_field.world
     if shaded:
-        rays = _kept_rays(launcher, scene, plan, kept) if _has_indirect(scene, plan) else None
+        rays = _kept_rays(launcher, scene, plan, kept) if _has_indirect(scene, plan) else ()
         hits = glossy_hits(launcher, scene, device_scene, light_field.bounces, settings.seed)
         for part in parts:
             if _has_indirect(scene, plan):
@@ -355,16 +358,19 @@ def _shade_direct(
         return lit()
 
 
-def _kept_rays(launcher: Launcher, scene: Scene, plan: Plan, kept: Kept | None) -> Any:
-    """What the rays gathered at real surfaces met in the real scene; None where that is not kept."""
+def _kept_rays(launcher: Launcher, scene: Scene, plan: Plan, kept: Kept | None) -> tuple[Any, ...]:
+    """What the rays gathered at real surfaces met in the real scene, at each stride; nothing where that is not kept."""
     settings = plan.settings
-    blocks = -(-plan.width // settings.gather_stride) * -(-plan.height // settings.gather_stride)
-    if kept is None or settings.gather == "cones" or blocks * settings.gather_rays > MOST_KEPT_RAYS:
-        return None
-    key = content_key(
-        scene.camera, plan.width, plan.height, settings.gather_stride, settings.gather_rays, settings.seed
-    )
-    return kept.get("gathered real hits", key, lambda: keep_rays(launcher, blocks, settings.gather_rays))
+    if kept is None or settings.gather == "cones":
+        return ()
+    grids = []
+    for level, stride in enumerate(strides(settings.gather_stride, settings.gather_detail)):
+        rays = rays_of(REAL_PARTS[min(level, 1)], settings.gather_rays)
+        grids.append((-(-plan.width // stride), -(-plan.height // stride), rays))
+    while grids and sum(columns * rows * rays for columns, rows, rays in grids) > MOST_KEPT_RAYS:
+        grids.pop()
+    key = content_key(scene.camera, tuple(grids), settings.gather_stride, settings.seed)
+    return kept.get("gathered real hits", key, lambda: tuple(keep_rays(launcher, *grid) for grid in grids))
 
 
 def _irradiance(
@@ -375,7 +381,7 @@ def _irradiance(
     hits: Any,
     buffer: GBuffer,
     part: _Part,
-    rays: Any,
+    rays: tuple[Any, ...],
     turns: Turns | None,
 ) -> tuple[Any, Any]:
     """Irradiance before and after at the part's points: sparse for what is seen, everywhere for what is hidden."""

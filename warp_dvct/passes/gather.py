@@ -38,6 +38,14 @@ def rays_of(part: str, rays: int) -> int:
     return max(1, rays // FEWER.get(part, 1))
 
 
+def strides(stride: int, detail: float) -> list[int]:
+    """Pixels between the gathered points: of the blocks, then each halved one of details."""
+    found = [stride]
+    while detail > 0.0 and found[-1] > FINEST and found[-1] % 2 == 0:
+        found.append(found[-1] // 2)
+    return found
+
+
 @dataclass(frozen=True)
 class Turn:
     """A share of the points of a part, runs of neighbours that lie evenly over all of them: the ``number``-th of ``of``
@@ -96,7 +104,8 @@ class Gatherer:
 
         ``nearness``, float ``[count]``, receives the mean inverse distance of what rays met (cones leave it alone).
         ``stride``: Spacing of the points in pixels. ``part``: One of ``GATHER_PARTS``, for turns and :func:`rays_of`.
-        ``kept``: ``KeptRays`` of ``count`` slots (:func:`keep_rays`), for pixels' centres on real surfaces.
+        ``kept``: ``KeptRays`` (:func:`keep_rays`) of blocks of that stride, for centres of pixels on real surfaces, one
+        of a block at most.
         ``beside``: Until it closes other work may go on beside the rays (:meth:`Launcher.beside`), and what is returned
         is not all there; without ``turns`` and ``cone``.
         """
@@ -112,7 +121,9 @@ class Gatherer:
         kernel = kernels._gather_rays if self.hits is None else kernels._gather_rays_glossy
         if self.hits is not None:
             shared.append(self.hits)
-        parts = launcher.parts(count)
+        if kept is None or self.turns is not None:
+            kept = keep_rays(launcher, 0, 0, 0)
+        parts = launcher.parts(kept.slots or count)  # the same in all frames that keep rays: each part keeps its own
         outputs = [before, after, nearness]
         if parts > 1:
             outputs = [launcher.empty(max(1, count * parts), array.dtype) for array in outputs]
@@ -126,7 +137,7 @@ class Gatherer:
                 self.edge_samples,
                 stride,
                 self.seed,
-                keep_rays(launcher, 0, 0) if kept is None or self.turns is not None else kept,
+                kept,
             ]
             runs = -(-count // kernels.RUN)
             elements = -(-runs // turn.of) * kernels.RUN * parts
@@ -139,10 +150,11 @@ class Gatherer:
         return before, after
 
 
-def keep_rays(launcher: Launcher, slots: int, rays: int) -> Any:
-    """Empty ``KeptRays``; with no slots, the one that keeps nothing."""
+def keep_rays(launcher: Launcher, columns: int, rows: int, rays: int) -> Any:
+    """Empty ``KeptRays`` for ``rays`` of each block's point; with no blocks, the one that keeps nothing."""
     kept = kernels.KeptRays()
-    kept.present = int(slots > 0)
+    slots = columns * rows
+    kept.slots, kept.columns = slots, columns
     kept.point = launcher.full(max(1, slots * launcher.parts(slots)), -1, wp.int32)
     kept.count = launcher.zeros(max(1, slots * launcher.parts(slots)), wp.int32)
     kept.reach = launcher.empty(max(1, slots * rays), wp.float32)
@@ -218,7 +230,8 @@ class SparseGather:
             at half the stride; 0 for never.
         change: Least change around a block, as a share of irradiance, for that; 0 for any. For pictures of which only
             the change is used.
-        kept: ``KeptRays`` with a slot per block, for the role REAL.
+        kept: ``KeptRays`` of the blocks, then of those of half the stride and so on, as far as there are any; for the
+            role REAL.
     """
 
     launcher: Launcher
@@ -230,7 +243,7 @@ class SparseGather:
     smoothing: int = 0
     detail: float = 0.0
     change: float = 0.0
-    kept: Any = None
+    kept: tuple[Any, ...] = ()
 
     def blocks(self, beside: ExitStack | None = None) -> _Grid:
         """The blocks' points and what they gather (``beside``: as in :meth:`Gatherer.run`)."""
@@ -243,7 +256,7 @@ class SparseGather:
             gathered.choice,
             columns * rows,
             nearness,
-            self.kept,
+            self._kept_at(0),
             stride=self.stride,
             part=self._parts[0],
             beside=beside,
@@ -254,8 +267,9 @@ class SparseGather:
         """Write to two vec3 ``[buffer.count]`` what follows from the :meth:`blocks`; 0 at the background."""
         launcher, points = self.launcher, self.buffer.points
         grid = self._smooth(grid, launcher.full(grid.count, 1, wp.int32))
-        while self.detail > 0.0 and grid.stride > FINEST and grid.stride % 2 == 0 and self.gatherer.cone is None:
-            grid = self._refine(grid)
+        if self.gatherer.cone is None:
+            for level in range(1, len(strides(self.stride, self.detail))):
+                grid = self._refine(grid, self._kept_at(level))
         missing = launcher.empty(self.buffer.count, wp.int32)
         guide = grid.guide(self.radius if grid.stride > 1 else min(self.radius, 1))
         launcher.launch(
@@ -299,7 +313,10 @@ class SparseGather:
             grid = replace(grid, before=before, after=after)
         return grid
 
-    def _refine(self, grid: _Grid) -> _Grid:
+    def _kept_at(self, level: int) -> Any:
+        return self.kept[level] if level < len(self.kept) else None
+
+    def _refine(self, grid: _Grid, kept: Any) -> _Grid:
         """A grid of half the stride: gathered where ``grid`` cannot tell, interpolated elsewhere."""
         launcher, points, stride = self.launcher, self.buffer.points, grid.stride // 2
         columns, rows = -(-self.buffer.width // stride), -(-self.buffer.height // stride)
@@ -322,7 +339,7 @@ class SparseGather:
         index = launcher.empty(max(1, found), wp.int32)
         launcher.launch(reconstruction._pick, found, [listed, gathered.choice], [index])
         near = launcher.empty(max(1, found), wp.float32)
-        fresh = self.gatherer.run(launcher, points, index, found, near, stride=stride, part=self._parts[1])
+        fresh = self.gatherer.run(launcher, points, index, found, near, kept, stride=stride, part=self._parts[1])
         launcher.launch(reconstruction._put_detail, found, [listed, *fresh, near], [before, after, nearness])
         return self._smooth(_Grid(stride, columns, rows, gathered, nearness, before, after), mark)
 
