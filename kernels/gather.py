@@ -95,6 +95,14 @@ class KeptRays:
 
 
 @wp.func
+def kept_slot(kept: KeptRays, points: Points, j: int, stride: int) -> int:
+    """The slot of the block of a point, if anything is kept."""
+    if kept.slots == 0:
+        return 0
+    return (points.pixel[j][1] / stride) * kept.columns + points.pixel[j][0] / stride
+
+
+@wp.func
 def kept_real(
     kept: KeptRays, keeps: bool, known: bool, at: int, geo: Geometry, origin: wp.vec3, direction: wp.vec3
 ) -> Hit:
@@ -212,7 +220,7 @@ def gather_at(
     seed: int,
     kept_out: KeptRays,
 ) -> Gathered:
-    """Of point ``j``'s rays, those of a part: the gathered point's number, the part's, and how many parts there are.
+    """Of point ``j``'s rays, those of a part: the slot that keeps them, the part's number, how many parts there are.
 
     ``hits``: ``GlossyHits`` or ``Lambertian``.
     """
@@ -225,10 +233,8 @@ def gather_at(
     if aim.rays > 0:
         even = few
     known = False
-    place = int(0)
     if kept_out.slots != 0:
-        place = (points.pixel[j][1] / stride) * kept_out.columns + points.pixel[j][0] / stride
-        slot = place * part[2] + part[1]
+        slot = part[0] * part[2] + part[1]
         # As many even rays as before are the same rays: their numbers start by how many there are.
         known = kept_out.point[slot] == j and kept_out.count[slot] == even
         kept_out.point[slot] = j
@@ -248,7 +254,7 @@ def gather_at(
         ray = ray_over(s, disk, weight)
         if ray.up != 0:
             keeps = kept_out.slots != 0 and k < even
-            at = place * rays + k
+            at = part[0] * rays + k
             ray.real = kept_real(kept_out, keeps, keeps and known, at, geo, ray.origin, ray.direction)
             ray.synthetic = no_hit(ray.real.t)
             if not clear_of_objects(geo, body, s.normal_g, ray.origin, ray.direction, ray.real.t):
@@ -298,12 +304,13 @@ def _gather_rays(
     i = of_turn(t / turn[3], turn[0], turn[1])
     if i >= turn[2]:
         return
-    part = wp.vec3i(i, t % turn[3], turn[3])
+    part = wp.vec3i(0, t % turn[3], turn[3])
     j = index_in[i]
     total = Gathered()
     if j >= 0:
         if points.role[j] != BACKGROUND:
             hits = Lambertian()
+            part[0] = kept_slot(kept_out, points, j, stride)
             total = gather_at(
                 part, j, points, geo, world, hits, targets, rays, aimed, edge_samples, stride, seed, kept_out
             )
@@ -338,11 +345,12 @@ def _gather_rays_glossy(
     i = of_turn(t / turn[3], turn[0], turn[1])
     if i >= turn[2]:
         return
-    part = wp.vec3i(i, t % turn[3], turn[3])
+    part = wp.vec3i(0, t % turn[3], turn[3])
     j = index_in[i]
     total = Gathered()
     if j >= 0:
         if points.role[j] != BACKGROUND:
+            part[0] = kept_slot(kept_out, points, j, stride)
             total = gather_at(
                 part, j, points, geo, world, hits, targets, rays, aimed, edge_samples, stride, seed, kept_out
             )
