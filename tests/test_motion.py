@@ -103,6 +103,17 @@ def test_edges_come_back_after_frames_with_others(plate, other):
     assert same(frame, relighter(moment).render(plate))
 
 
+def test_objects_leave_and_come_back(plate):
+    """Without any, no row changes, and all edges stay."""
+    moving = relighter(scene())
+    moving.render(plate)
+    empty = replace(scene(), meshes=tuple(m for m in scene().meshes if m.role == Role.REAL))
+    for moment in (empty, empty, scene((0.03, 0.02, 0.0))):
+        moving.set_scene(moment)
+        frame = moving.render(plate)
+        assert same(frame, relighter(moment).render(plate))
+
+
 def test_edges_above_the_objects_are_not_traced_again(plate, monkeypatch):
     traced = []
     launch = Launcher.launch
