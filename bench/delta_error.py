@@ -17,7 +17,7 @@ from warp_dvct.device_scene import DeviceScene
 from warp_dvct.errors import OptionError
 from warp_dvct.kernels import cones
 from warp_dvct.launch import Launcher
-from warp_dvct.methods.delta_cone_tracing import LightField, light_volumes
+from warp_dvct.methods.light_field import LightField, light_volumes
 from warp_dvct.passes.gather import Gatherer, gather_all
 from warp_dvct.passes.gbuffer import render_gbuffer
 from warp_dvct.plan import Plan, make_plan

@@ -19,7 +19,8 @@ from warp_dvct.bench.error import read, stage_file
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.errors import FileError, OptionError
 from warp_dvct.launch import Launcher
-from warp_dvct.methods.delta_cone_tracing import light_volumes, render
+from warp_dvct.methods.delta_cone_tracing import render
+from warp_dvct.methods.light_field import light_volumes
 from warp_dvct.metrics import to_display
 from warp_dvct.passes.composite import composite
 from warp_dvct.plan import Plan, make_plan

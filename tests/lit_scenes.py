@@ -13,7 +13,7 @@ from warp_dvct.kernels import cones, shading
 from warp_dvct.kernels.gbuffer import WHOLE
 from warp_dvct.kernels.volume import Volume, find_record
 from warp_dvct.launch import Launcher
-from warp_dvct.methods.delta_cone_tracing import _normals, _world
+from warp_dvct.methods import light_field
 from warp_dvct.passes.gbuffer import new_points
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
 from warp_dvct.passes.voxels import Box, Voxels, voxelize
@@ -123,7 +123,7 @@ def upload(launcher: Launcher, scene: Scene) -> DeviceScene:
 
 def unit_normals(launcher: Launcher, device_scene: DeviceScene) -> Any:
     """Unit geometric normals of all triangles."""
-    return launcher.array(_normals(device_scene.triangles_vs), wp.vec3)
+    return launcher.array(light_field.unit_normals(device_scene.triangles_vs), wp.vec3)
 
 
 def voxels_of(launcher: Launcher, device_scene: DeviceScene, n: int, low=(0.0, 0.0, 0.0), edge: float = 1.0) -> Voxels:
@@ -206,9 +206,8 @@ def lit_world(
         light_faces(launcher, voxels, flux_of(device_scene, voxels), filter=filter)
         build_pyramid(launcher, voxels, filter=filter)
         volumes.append(voxels)
-    return Lit(
-        scene, device_scene, tuple(volumes), _world(launcher, scene, unit_normals(launcher, device_scene), volumes)
-    )
+    world = light_field.world_of(launcher, scene, unit_normals(launcher, device_scene), volumes)
+    return Lit(scene, device_scene, tuple(volumes), world)
 
 
 def points_at(launcher: Launcher, positions, normals, *, role=0, color=(0.5, 0.5, 0.5), reach: float = 1.0) -> Any:
@@ -243,7 +242,7 @@ def points_on(
     uv = np.where(uv.sum(1, keepdims=True) > 1, 1 - uv, uv)
     weights = np.concatenate([1 - uv.sum(1, keepdims=True), uv], 1) * (1 - inset) + inset / 3
     positions = np.einsum("pk,pkx->px", weights, corners[pick])
-    normals = _normals(device_scene.triangles_vs)[pick]
+    normals = light_field.unit_normals(device_scene.triangles_vs)[pick]
     return points_at(launcher, positions, normals, role=device_scene.role[pick]), pick
 
 

@@ -174,7 +174,7 @@ def test_voxels_and_patches_are_those_of_a_frame(surveys):
     """Counts from 32 voxels an edge against those of volumes of 64 and 128, whose numbers nothing here fits."""
     from warp_dvct.cost import _patches
     from warp_dvct.device_scene import DeviceScene
-    from warp_dvct.methods.delta_cone_tracing import light_volumes
+    from warp_dvct.methods.light_field import light_volumes
     from warp_dvct.plan import make_plan
 
     launcher, scene, room = Launcher("cpu", 2), read_stage(path("room_area")), surveys["room_area"]

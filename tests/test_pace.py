@@ -15,7 +15,8 @@ from warp_dvct.budget import SHOWS
 from warp_dvct.cost import PROBE, gather_part, gather_points
 from warp_dvct.cost_model import price
 from warp_dvct.device_scene import DeviceScene
-from warp_dvct.methods.delta_cone_tracing import light_volumes, render
+from warp_dvct.methods.delta_cone_tracing import render
+from warp_dvct.methods.light_field import light_volumes
 from warp_dvct.pace import BELIEVED, LAST, LATER, Pace, try_machine
 from warp_dvct.passes.gather import Turn
 from warp_dvct.plan import make_plan

@@ -13,7 +13,7 @@ from warp_dvct import usd_scenes
 from warp_dvct.device_scene import DeviceScene
 from warp_dvct.errors import DeviceError, OptionError
 from warp_dvct.layers import Layers
-from warp_dvct.methods import delta_cone_tracing
+from warp_dvct.methods import light_field
 from warp_dvct.relighter import Relighter, relight
 from warp_dvct.scene import Light, LightKind, LightRole, Material, Mesh, Role, Scene
 
@@ -309,7 +309,7 @@ over "World"
 
 def test_what_did_not_change_stays_on_the_device(shot, monkeypatch):
     uploads = Spy(monkeypatch, DeviceScene, "upload")
-    volumes = Spy(monkeypatch, delta_cone_tracing, "light_volumes")
+    volumes = Spy(monkeypatch, light_field, "light_volumes")
     relighter = Relighter(shot, settings=FAST, time=1, **SIZE)
     frames = {1: relighter.render()}
     assert (uploads.calls, volumes.calls) == (1, 1)

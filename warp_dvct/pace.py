@@ -29,7 +29,7 @@ from warp_dvct.survey import Survey
 from warp_dvct.turns import SLOWNESS, GatherTurns, with_rays
 
 if TYPE_CHECKING:
-    from warp_dvct.methods.delta_cone_tracing import LightField
+    from warp_dvct.methods.light_field import LightField
 
 WIDTH = 80  # of the picture whose points are gathered on trial
 TRIALS = 3  # of which the median counts: another process may hold a thread up in one of them

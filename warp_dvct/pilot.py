@@ -13,6 +13,7 @@ from warp_dvct.kept import Kept
 from warp_dvct.launch import Launcher
 from warp_dvct.layers import Layers
 from warp_dvct.methods import delta_cone_tracing
+from warp_dvct.methods.light_field import light_volumes
 from warp_dvct.metrics import affected_mask, smooth_delta, to_display
 from warp_dvct.passes.composite import composite
 from warp_dvct.passes.gather import glossy_hits
@@ -115,7 +116,7 @@ def make_pilot(
         once: ``plan`` with a single bounce. again: ``plan`` with another seed.
     """
     kept = Kept()
-    lit = delta_cone_tracing.light_volumes(launcher, scene, device_scene, plan, kept)
+    lit = light_volumes(launcher, scene, device_scene, plan, kept)
     needs = [VolumeNeed(v.box.n, v.level_records[0], v.fragments.count) for v in lit.volumes]
     fine = needs[0] if needs else VolumeNeed(plan.fine.n, 0, 0)
     patches = 0.0
@@ -130,7 +131,7 @@ def make_pilot(
             launcher, scene, device_scene, lambda: lit, plan, with_before=True, kept=kept
         )
         layers = composite(launcher, radiance, None)
-        first = delta_cone_tracing.light_volumes(launcher, scene, device_scene, once, kept)
+        first = light_volumes(launcher, scene, device_scene, once, kept)
         others = []
         for light, other in ((first, once), (lit, again)):
             radiance = delta_cone_tracing.render(

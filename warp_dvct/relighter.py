@@ -17,7 +17,7 @@ from warp_dvct.kept import Kept, content_key
 from warp_dvct.launch import Launcher
 from warp_dvct.layers import Layers, Radiance
 from warp_dvct.memory import require_countable, require_memory
-from warp_dvct.methods import delta_cone_tracing, instant_radiosity, path_tracing
+from warp_dvct.methods import delta_cone_tracing, instant_radiosity, light_field, path_tracing
 from warp_dvct.passes.composite import composite
 from warp_dvct.passes.difference import tonemap_difference
 from warp_dvct.passes.lens import LensView
@@ -36,8 +36,8 @@ METHODS = ("delta-cones", "instant-radiosity", "path-trace")
 DEFAULT_WIDTH = 960
 
 Progress = Callable[[str, float], None]
-Lit = delta_cone_tracing.LightField | instant_radiosity.Shot  # what a method keeps while only the camera moves
-LitKind = TypeVar("LitKind", delta_cone_tracing.LightField, instant_radiosity.Shot)
+Lit = light_field.LightField | instant_radiosity.Shot  # what a method keeps while only the camera moves
+LitKind = TypeVar("LitKind", light_field.LightField, instant_radiosity.Shot)
 
 
 class Relighter:
@@ -302,12 +302,12 @@ class Relighter:
         report("upload", 0.0)
         device_scene = self._device_scene()
 
-        def lit() -> delta_cone_tracing.LightField:
+        def lit() -> light_field.LightField:
             report("volumes", 0.2)
-            make = partial(delta_cone_tracing.light_volumes, launcher, scene, device_scene, plan, self._kept)
-            light_field = self._lit(delta_cone_tracing.LightField, make)
+            make = partial(light_field.light_volumes, launcher, scene, device_scene, plan, self._kept)
+            volumes = self._lit(light_field.LightField, make)
             report("shading", 0.5)
-            return light_field
+            return volumes
 
         turns, pace = None, None if isinstance(self._pace, SamplePace) else self._pace
         ready = lit() if pace is not None or not self._overlap else None

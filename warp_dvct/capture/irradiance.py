@@ -13,7 +13,7 @@ from warp_dvct.device_scene import DeviceScene
 from warp_dvct.kernels.gbuffer import REAL, WHOLE, Points
 from warp_dvct.kernels.shading import Direct
 from warp_dvct.launch import Launcher
-from warp_dvct.methods.delta_cone_tracing import light_volumes
+from warp_dvct.methods.light_field import light_volumes
 from warp_dvct.passes.gather import Gatherer, gather_all
 from warp_dvct.passes.shading import shade_direct
 from warp_dvct.plan import Plan, make_plan
