@@ -16,7 +16,7 @@ from warp_dvct.launch import Launcher
 from warp_dvct.methods import light_field
 from warp_dvct.passes.gbuffer import new_points
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
-from warp_dvct.passes.voxels import Box, Voxels, voxelize
+from warp_dvct.passes.voxels import Box, Voxels, unlit, voxelize
 from warp_dvct.scene import Camera, Light, LightKind, Material, Mesh, Role, Scene
 
 GREY = Material(base_color=(0.5, 0.4, 0.3), ior=1.0)
@@ -131,7 +131,8 @@ def voxels_of(launcher: Launcher, device_scene: DeviceScene, n: int, low=(0.0, 0
     corners = launcher.array(device_scene.triangles_vs.reshape(-1, 3), wp.vec3)
     normals = unit_normals(launcher, device_scene)
     sides = device_scene.geometry.double_sided
-    return voxelize(launcher, corners, normals, sides, device_scene.synthetic_first, Box(tuple(low), edge, n))
+    box = Box(tuple(low), edge, n)
+    return unlit(launcher, voxelize(launcher, corners, normals, sides, device_scene.synthetic_first, box))
 
 
 def areas(voxels: Voxels) -> np.ndarray:

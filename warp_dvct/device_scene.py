@@ -28,6 +28,7 @@ from warp_dvct.targets import targets_of
 
 # A closed mesh may be met from behind by the odd ray that slips through an edge; this many are no accident.
 BACKS_MET = 4
+TRIANGLES = "all triangles"
 # Sine of the angle between a flat light's plane and its direction, below which float32 axes do not tell the side.
 LEAST_SIDE = 1e-6
 
@@ -85,24 +86,21 @@ class DeviceScene:
         origin = np.asarray(origin, np.float64).reshape(3)
         if not (np.isfinite(scale) and scale > 0):
             raise ValueError(f"scale is {scale}; it must be positive and finite")
-        _check_indices(scene)
-        host = _HostTriangles.gather(scene, origin, scale)
         kept = kept or Kept()
-        first = host.synthetic_first
-        boxes = host.boxes(first)
-        corners, building = _begin_mesh(launcher, host.triangles[first:])
-        # Beside the tree's building: nothing here asks it.
+        camera = camera_frame(scene.camera, origin, scale)
+        triangles = kept.last(TRIANGLES, kept.objects)
+        build = None if triangles else _begin_triangles(launcher, scene, origin, scale, camera.origin, kept)
+        # Beside the building of the objects' tree: nothing here asks it.
         materials = kept.get("materials", None, lambda: _upload_materials(launcher, scene.materials, scene.textures))
         light_keys = tuple(kept.light_key(scene, i) for i in range(len(scene.lights)))
         lights = kept.get("lights", light_keys, lambda: upload_lights(launcher, scene.lights, origin, scale))
-        camera = camera_frame(scene.camera, origin, scale)
-        hulls = new_hulls(launcher, corners, boxes, host.vertices[host.first :], host.counts[host.first :])
-        hulls.look_from(launcher, camera.origin)
-        real, hull = kept.get("real triangles", None, lambda: _real(launcher, host))
-        synthetic = building()
-        geometry = _upload_geometry(launcher, host, real, synthetic, boxes)
-        hulls.set(geometry)
-        blocking = hull.blocking(boxes, scene.lights, origin, scale)
+        if build is not None:
+            triangles = build()
+            kept.put(TRIANGLES, kept.objects, triangles)
+        host, real = triangles.host, triangles.real
+        triangles.hulls.look_from(launcher, camera.origin)
+        geometry = triangles.geometry()
+        blocking = triangles.hull.blocking(triangles.boxes, scene.lights, origin, scale)
         blockers, box = kept.get("blockers", blocking.tobytes(), lambda: _blockers(launcher, host, real, blocking))
         _set_blockers(geometry, blockers, box)
         double_sided = _both_sides(launcher, host, geometry, materials, lights)
@@ -112,11 +110,11 @@ class DeviceScene:
             materials=materials,
             lights=lights,
             camera=camera,
-            hulls=hulls,
+            hulls=triangles.hulls,
             real=real,
-            synthetic=synthetic,
+            synthetic=triangles.synthetic,
             blockers=blockers,
-            targets=targets_of(boxes),
+            targets=targets_of(triangles.boxes),
             triangles_vs=host.triangles,
             role=host.role,
             double_sided=double_sided,
@@ -194,6 +192,54 @@ class _HostTriangles:
         )
 
 
+@dataclass(frozen=True)
+class _Triangles:
+    """What the surfaces decide, whatever the lights are.
+
+    Attributes:
+        boxes: Of the synthetic meshes, ``[m, 2, 3]``.
+        surfaces: ``Geometry`` without what lights decide of it: blockers and sides.
+    """
+
+    host: _HostTriangles
+    boxes: np.ndarray
+    real: Any
+    hull: RealHull
+    synthetic: Any
+    hulls: Hulls
+    surfaces: Any
+
+    def geometry(self) -> Any:
+        """A copy of ``surfaces``, on the same arrays, to be completed."""
+        geometry = Geometry()
+        for name in Geometry.vars:
+            setattr(geometry, name, getattr(self.surfaces, name))
+        return geometry
+
+
+def _begin_triangles(
+    launcher: Launcher, scene: Scene, origin: np.ndarray, scale: float, eye: Any, kept: Kept
+) -> Callable[[], _Triangles]:
+    """Begin to build the tree of the synthetic triangles on a thread of its own; the call does the rest meanwhile, and
+    waits for it."""
+    _check_indices(scene)
+    host = _HostTriangles.gather(scene, origin, scale)
+    boxes = host.boxes(host.synthetic_first)
+    arrays = _mesh_arrays(launcher, host.triangles[host.synthetic_first :])
+    building = launcher.apart(lambda: _mesh(*arrays))
+
+    def finish() -> _Triangles:
+        hulls = new_hulls(launcher, arrays[0], boxes, host.vertices[host.first :], host.counts[host.first :])
+        hulls.look_from(launcher, eye)
+        real, hull = kept.get("real triangles", None, lambda: _real(launcher, host))
+        synthetic = building()
+        surfaces = _upload_geometry(launcher, host, real, synthetic, boxes)
+        hulls.set(surfaces)
+        return _Triangles(host, boxes, real, hull, synthetic, hulls, surfaces)
+
+    return finish
+
+
 def _check_indices(scene: Scene) -> None:
     for mesh in scene.meshes:
         if not len(mesh.triangles):
@@ -209,12 +255,6 @@ def _check_range(mesh: Mesh, what: str, indices: np.ndarray, count: int) -> None
         raise StageError(
             f"{mesh.path}: {what} index {wrong} is out of range; there are {count}. Mend the mesh's indices"
         )
-
-
-def _begin_mesh(launcher: Launcher, triangles: np.ndarray) -> tuple[Any, Callable[[], Any]]:
-    """Corners of triangles, and those with their tree, which a thread of its own builds: the call waits for it."""
-    arrays = _mesh_arrays(launcher, triangles)
-    return arrays[0], launcher.apart(lambda: _mesh(*arrays))
 
 
 def _real(launcher: Launcher, host: _HostTriangles) -> tuple[Any, RealHull]:

@@ -200,6 +200,7 @@ class Relighter:
         report = progress or (lambda name, share: None)
         launcher = self._launcher
         launcher.reset_times()
+        self._kept.begin_frame()
         compiled, compiled_cpu = launcher.compile_seconds, launcher.compile_cpu_seconds
         start, start_cpu = clock.perf_counter(), clock.process_time()
         if self._pace is not None:
@@ -278,11 +279,11 @@ class Relighter:
         """The scene on the device: the kept one, with the camera of this frame, where nothing else changed."""
         origin, scale = np.asarray(self.plan.origin), self.plan.scale
         self._kept.lights = tuple(content_key(light) for light in self._drawn.lights)
-        real, key = _content_keys(self._drawn, self.plan, self._kept.lights)
+        real, objects, key = _content_keys(self._drawn, self.plan, self._kept.lights)
         if self._uploaded is None or self._uploaded[0] != key:
             with self._launcher.scope("upload"):
                 self._uploaded = None  # free the old one first
-                self._kept.set_real(real)
+                self._kept.set_scene(real, objects)
                 uploaded = DeviceScene.upload(self._launcher, self._drawn, origin, scale, self._kept)
             self._uploaded = (key, uploaded, None)
         return self._uploaded[1].seen_by(self._launcher, self._drawn.camera)
@@ -358,17 +359,18 @@ class Relighter:
         return self._through_lens(radiance)
 
 
-def _content_keys(scene: Scene, plan: Plan, lights: tuple[str, ...]) -> tuple[str, str]:
-    """Hashes of the real scene in volume space, and of all that uploaded data and lit volumes depend on: everything
-    but camera, plate and picture size."""
+def _content_keys(scene: Scene, plan: Plan, lights: tuple[str, ...]) -> tuple[str, str, str]:
+    """Hashes of the real scene in volume space, of the synthetic surfaces, and of all that uploaded data and lit
+    volumes depend on: everything but camera, plate and picture size."""
     surfaces = scene.materials, scene.textures
     meshes = [tuple(m for m in scene.meshes if m.role == role) for role in Role]
     clouds = [tuple(c for c in scene.point_clouds if c.role == role) for role in Role]
     real = content_key(meshes[Role.REAL], clouds[Role.REAL], *surfaces, plan.origin, plan.scale)
+    objects = content_key(meshes[Role.SYNTHETIC], clouds[Role.SYNTHETIC])
     passes = tuple(p.needed for p in plan.passes if p.name in ("voxelize", "pyramid", "bounces"))
     settings = replace(plan.settings, gather_rays=0, gather_object_rays=0)  # the camera's passes alone read these
     rest = (settings, plan.fine, plan.coarse, plan.start, plan.maps, passes)
-    return real, content_key(real, meshes[Role.SYNTHETIC], clouds[Role.SYNTHETIC], lights, *rest)
+    return real, objects, content_key(real, objects, lights, *rest)
 
 
 def relight(stage: Any, *, plate: np.ndarray | None = None, ldr: bool = False, **options: Any) -> Layers:

@@ -17,7 +17,7 @@ from warp_dvct.passes.bounces import mean_albedo
 from warp_dvct.passes.injection import empty_flux, inject
 from warp_dvct.passes.pyramid import build_pyramid, light_faces
 from warp_dvct.passes.rsm import ShadowMaps, render_rsm
-from warp_dvct.passes.voxels import Box, Voxels, voxelize
+from warp_dvct.passes.voxels import Box, Voxels, unlit, voxelize
 from warp_dvct.scene import Scene
 
 N = 12
@@ -30,7 +30,7 @@ def voxels_of(launcher: Launcher, twin: Twin) -> Voxels:
     corners = launcher.array(twin.corners.reshape(-1, 3).astype(np.float32), wp.vec3)
     sides = twin.device.geometry.double_sided
     box = Box((0.0, 0.0, 0.0), 1.0, N)
-    return voxelize(launcher, corners, twin.device_normals(launcher), sides, twin.reals, box)
+    return unlit(launcher, voxelize(launcher, corners, twin.device_normals(launcher), sides, twin.reals, box))
 
 
 def cells(voxels: Voxels, level: int) -> np.ndarray:

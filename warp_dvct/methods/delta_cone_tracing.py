@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import warp as wp
@@ -64,30 +65,12 @@ def render(
     Args:
         lit: Gives the lit volumes. Shadow rays need none of them, so cores that this leaves idle trace those.
         with_before: Also render the real scene alone, to serve as the plate.
-        kept: Holds what the real scene and the camera alone decide from frame to frame.
+        kept: Holds what the real scene and the camera alone decide from frame to frame, and what no light does.
         turns: Decide how many rays are gathered instead of the plan's settings.
     """
     settings = plan.settings
     with launcher.scope("gbuffer"):
-        view = None
-        if kept is not None:
-            key = content_key(scene.camera, plan.width, plan.height)
-            view = kept.get(
-                "camera's real hits",
-                key,
-                lambda: new_view(launcher, device_scene, plan.width, plan.height, settings.antialias),
-            )
-        buffer = render_gbuffer(
-            launcher,
-            device_scene,
-            plan.width,
-            plan.height,
-            edge_samples=settings.antialias,
-            behind=with_before,
-            paint=with_before or not scene.captured,
-            seed=settings.seed,
-            view=view,
-        )
+        buffer = _look(launcher, scene, device_scene, plan, with_before, kept)
     shaded = plan.changes or with_before
     # The direct pass writes every point.
     light = (launcher.empty if shaded else launcher.zeros)(buffer.count, wp.vec3)
@@ -132,6 +115,25 @@ def render(
             behind_before=hidden_before,
             with_before=with_before,
         )
+
+
+def _look(
+    launcher: Launcher, scene: Scene, device_scene: DeviceScene, plan: Plan, with_before: bool, kept: Kept | None
+) -> GBuffer:
+    """What the camera sees: the last frame's if no surface moved, else the last frame's of the real scene."""
+    width, height, edge_samples = plan.width, plan.height, plan.settings.antialias
+    how = {
+        "edge_samples": edge_samples,
+        "behind": with_before,
+        "paint": with_before or not scene.captured,
+        "seed": plan.settings.seed,
+    }
+    make = partial(render_gbuffer, launcher, device_scene, width, height, **how)
+    if kept is None:
+        return make()
+    key = content_key(scene.camera, width, height)
+    view = kept.get("camera's real hits", key, lambda: new_view(launcher, device_scene, width, height, edge_samples))
+    return kept.get("all that the camera sees", (key, kept.objects, *how.values()), lambda: make(view=view))
 
 
 @dataclass(frozen=True)

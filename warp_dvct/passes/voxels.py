@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -58,7 +58,7 @@ class Voxels:
 
     Attributes:
         box: Where it is.
-        volume: The brick maps of all levels; ``field`` is zero.
+        volume: The brick maps of all levels, which the voxels of :func:`unlit` share; ``field`` is empty, or theirs.
         level_records: Records of each level; level ``l`` starts at ``sum(level_records[:l])``.
         level_keys: Sorted voxel keys per level.
         area: vec2 ``[level-0 records * 6]``, projected area per face, before and after, in voxel faces.
@@ -114,7 +114,7 @@ def voxelize(
         most: Levels are built until one has no more records than this; 0 for all levels.
         real: What :func:`cut_triangles` made of the real triangles, where that is at hand.
     Returns:
-        Voxels with a zero field. Triangles outside of the box are left out.
+        Voxels without a field (:func:`unlit`). Triangles outside of the box are left out.
     """
     if real is None:
         real = cut_triangles(launcher, part(launcher, triangles, 0, 3 * synthetic_first), box)
@@ -234,5 +234,14 @@ def _build_maps(launcher: Launcher, level_keys: list[Any], box: Box) -> Any:
     volume.table_start = launcher.array(table_start[:-1].copy(), wp.int32)
     volume.tables = tables
     volume.cells = cells
-    volume.field = launcher.zeros(12 * volume.records, wp.vec4)
+    volume.field = launcher.empty(0, wp.vec4)
     return volume
+
+
+def unlit(launcher: Launcher, voxels: Voxels) -> Voxels:
+    """The same voxels with a zero field of their own, to be lit."""
+    volume = Volume()
+    for name in Volume.vars:
+        setattr(volume, name, getattr(voxels.volume, name))
+    volume.field = launcher.zeros(12 * volume.records, wp.vec4)
+    return replace(voxels, volume=volume)
