@@ -226,6 +226,7 @@ def _sweep(stage: str, trials: Any, spp: int, pairs: tuple[str, ...], json_file:
 @click.option("--stage", default="room_area", show_default=True, help="A bundled stage or a USD file.")
 @click.option("--frames", type=int, default=60, show_default=True, help="Of the shot.")
 @click.option("--light", is_flag=True, help="Move a light instead of the synthetic objects.")
+@click.option("--plate/--no-plate", default=True, help="Composite on plates, or render the light before as well.")
 @click.option("--quality", default="balanced", show_default=True)
 @click.option("--width", type=int, default=640, show_default=True, help="Pixels; the height follows the camera.")
 @click.option("--checks", type=int, default=3, show_default=True, help="Frames compared with frames from scratch.")

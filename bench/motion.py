@@ -36,6 +36,7 @@ class MotionOptions:
 
     frames: int = 60
     light: bool = False
+    plate: bool = True
     quality: str = "balanced"
     settings: dict[str, str] = field(default_factory=dict)
     width: int = 640
@@ -82,12 +83,14 @@ class MotionReport:
 
     Attributes:
         seconds, cpu_seconds: Per warm frame: on the clock, and of all threads together.
+        plate: Whether frames were composited on a plate, or rendered the light before as well.
         passes: Median seconds of each pass. kept: Per kept result, the share of warm frames that reused it.
         checked, equal: Frames compared with a frame from scratch, and how many of these were equal bit for bit.
     """
 
     stage: str
     moving: str
+    plate: bool
     size: tuple[int, int]
     machine: str
     seconds: list[float]
@@ -147,8 +150,7 @@ def _with_light(scene: Scene, index: int, offset: np.ndarray, turn: np.ndarray) 
 
 
 def measure(stage: str, options: MotionOptions) -> MotionReport:
-    """Render a shot frame after frame by one Relighter, with a plate where only objects move (the photograph stays),
-    and without one where a light does.
+    """Render a shot frame after frame by one Relighter, on the plates that a camera would have taken of the real scene.
 
     Args:
         stage: A bundled stage's name, or a USD file.
@@ -159,12 +161,12 @@ def measure(stage: str, options: MotionOptions) -> MotionReport:
         import_flip()
     scene = read(stage_file(stage))
     scenes = shot(scene, options.frames, options.light)
+    plates = _plates(scenes, options)
     relighter = _relighter(scenes[0], options, options.width)
-    plate = None if options.light else _plate(relighter)
-    relighter.render(plate)
+    relighter.render(plates[0])
     seconds, cpu, passes, kept, checked, equal = [], [], [], [], 0, 0
     check = {round(k) for k in np.linspace(1, options.frames - 1, options.checks)} if options.checks else set()
-    for n, moment in enumerate(scenes[1:], 1):
+    for n, (moment, plate) in enumerate(zip(scenes[1:], plates[1:], strict=True), 1):
         start, start_cpu = time.perf_counter(), time.process_time()
         relighter.set_scene(moment)
         layers = relighter.render(plate)
@@ -178,6 +180,7 @@ def measure(stage: str, options: MotionOptions) -> MotionReport:
     return MotionReport(
         Path(stage).stem,
         "a light" if options.light else "the synthetic objects",
+        options.plate,
         (relighter.width, relighter.height),
         machine(),
         seconds,
@@ -209,9 +212,18 @@ def _relighter(scene: Scene, options: MotionOptions, width: int) -> Relighter:
     )
 
 
-def _plate(relighter: Relighter) -> np.ndarray:
-    """The real scene as the method renders it: as good a photograph as any where speed is measured."""
-    return np.ascontiguousarray(relighter.render().plate)
+def _plates(scenes: Sequence[Scene], options: MotionOptions) -> Sequence[np.ndarray | None]:
+    """The real scene of each frame as the method renders it: as good a photograph as any where speed is measured.
+
+    While only objects move it is one photograph.
+    """
+    if not options.plate:
+        return [None] * len(scenes)
+    film, plates = _relighter(scenes[0], options, options.width), []
+    for moment in scenes if options.light else scenes[:1]:
+        film.set_scene(moment)
+        plates.append(np.ascontiguousarray(film.render().plate))
+    return plates if options.light else plates * len(scenes)
 
 
 def _flicker(scenes: Sequence[Scene], options: MotionOptions) -> Flicker:
@@ -318,7 +330,8 @@ def format_report(report: MotionReport) -> str:
     """The report for a terminal."""
     milli = 1e3 * np.array(report.seconds)
     lines = [
-        f"{report.stage} {report.size[0]}x{report.size[1]}, {report.moving} moving, {len(milli)} warm frames;"
+        f"{report.stage} {report.size[0]}x{report.size[1]}, {report.moving} moving, {len(milli)} warm frames"
+        f" {'on plates' if report.plate else 'without a plate'};"
         f" {report.machine}",
         f"{report.frames_per_second:.2f} frames/s (median {np.median(milli):.0f} ms, 9 of 10 below"
         f" {np.quantile(milli, 0.9):.0f} ms), {1e3 * np.median(report.cpu_seconds):.0f} ms of processor time a frame",

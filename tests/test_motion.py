@@ -289,8 +289,8 @@ def test_flicker_of_a_steady_error_is_nothing():
     assert flicker_of(noisy, truths) > 0.05
 
 
-@pytest.mark.parametrize("light", [False, True])
-def test_the_truth_of_flicker_says_what_its_own_noise_is_worth(light, tmp_path):
+@pytest.mark.parametrize(("light", "plate"), [(False, True), (True, True), (True, False)])
+def test_the_truth_of_flicker_says_what_its_own_noise_is_worth(light, plate, tmp_path):
     """A short shot from end to end. Without what the two halves of the truth differ by, figures against four and
     against 256 samples a pixel agree better than with it; frames equal frames from scratch."""
 
@@ -298,7 +298,7 @@ def test_the_truth_of_flicker_says_what_its_own_noise_is_worth(light, tmp_path):
         options = MotionOptions(
             frames=6, light=light, quality="draft", width=48, checks=1, flicker=3, flicker_width=48, samples=samples
         )
-        return measure("room_area", replace(options, cache=tmp_path))
+        return measure("room_area", replace(options, plate=plate, cache=tmp_path))
 
     few, many = report(4), report(256)
     assert many.checked == many.equal == 1
