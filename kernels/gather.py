@@ -80,7 +80,8 @@ def ray_incident(world: World, geo: Geometry, origin: wp.vec3, direction: wp.vec
 
 @wp.struct
 class KeptRays:
-    """What the rays of gather points met in the real scene, from frame to frame of a shot.
+    """What the rays of gather points met, from frame to frame of a shot: in the real scene and, where objects stay as
+    well, on these.
 
     Each block of ``stride`` x ``stride`` pixels has a slot for its point's rays, which is refilled whenever that point
     is another one.
@@ -92,6 +93,10 @@ class KeptRays:
     count: wp.array(dtype=wp.int32)  # [slots * parts], how many of its rays are kept
     reach: wp.array(dtype=wp.float32)  # [slots * rays], hit distance
     triangle: wp.array(dtype=wp.int32)  # [slots * rays], -1 where the ray meets nothing
+    whole: wp.int32  # rays of a slot, aimed ones as well, of which it is kept what they meet on objects; 0: of none
+    filled: wp.array(dtype=wp.int32)  # [slots * parts], 1 where those are kept
+    object_reach: wp.array(dtype=wp.float32)  # [slots * whole], hit distance on objects
+    object_triangle: wp.array(dtype=wp.int32)  # [slots * whole], -1 where the ray meets none
 
 
 @wp.func
@@ -130,6 +135,26 @@ class Ray:
     solid_angle: wp.float32
     real: Hit
     synthetic: Hit
+
+
+@wp.func
+def kept_synthetic(
+    kept: KeptRays, keeps: bool, known: bool, at: int, geo: Geometry, body: int, s: Surface, ray: Ray
+) -> Hit:
+    """The synthetic surface along a ray before the real one: as ``kept_real``."""
+    hit = no_hit(ray.real.t)
+    if known:
+        hit.t = kept.object_reach[at]
+        hit.triangle = kept.object_triangle[at]
+        hit.found = wp.where(hit.triangle >= 0, 1, 0)
+        hit.synthetic = hit.found
+    else:
+        if not clear_of_objects(geo, body, s.normal_g, ray.origin, ray.direction, ray.real.t):
+            hit = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
+        if keeps:
+            kept.object_reach[at] = hit.t
+            kept.object_triangle[at] = hit.triangle
+    return hit
 
 
 @wp.func
@@ -233,12 +258,16 @@ def gather_at(
     if aim.rays > 0:
         even = few
     known = False
+    filled = False
     if kept_out.slots != 0:
         slot = part[0] * part[2] + part[1]
-        # As many even rays as before are the same rays: their numbers start by how many there are.
+        # As many even rays as before are the same rays: their numbers start by how many there are. So are the aimed.
         known = kept_out.point[slot] == j and kept_out.count[slot] == even
         kept_out.point[slot] = j
         kept_out.count[slot] = even
+        if kept_out.whole != 0:
+            filled = known and kept_out.filled[slot] != 0
+            kept_out.filled[slot] = 1
     start = first_sample(even * pixel_points(points, j, edge_samples), even, stride, points, j)
     count = even + aim.rays
     for k in range(count * part[1] / part[2], count * (part[1] + 1) / part[2]):
@@ -253,12 +282,12 @@ def gather_at(
         weight = ray_weight(aim, even, disk, drawn)
         ray = ray_over(s, disk, weight)
         if ray.up != 0:
-            keeps = kept_out.slots != 0 and k < even
+            whole = k < kept_out.whole
+            keeps = kept_out.slots != 0 and (k < even or whole)
             at = part[0] * rays + k
-            ray.real = kept_real(kept_out, keeps, keeps and known, at, geo, ray.origin, ray.direction)
-            ray.synthetic = no_hit(ray.real.t)
-            if not clear_of_objects(geo, body, s.normal_g, ray.origin, ray.direction, ray.real.t):
-                ray.synthetic = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
+            same = (known and k < even) or (filled and whole)
+            ray.real = kept_real(kept_out, keeps, same, at, geo, ray.origin, ray.direction)
+            ray.synthetic = kept_synthetic(kept_out, whole, filled and whole, at, geo, body, s, ray)
             light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
             light = focused_incident(light, hits, geo, world, ray, start + k)
             total = add_light(total, light, weight)

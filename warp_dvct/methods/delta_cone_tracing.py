@@ -33,6 +33,7 @@ from warp_dvct.passes.gather import (
     focusing_materials,
     gather_all,
     glossy_hits,
+    keep_objects,
     keep_rays,
     rays_of,
     shade_indirect,
@@ -46,7 +47,7 @@ from warp_dvct.passes.specular import find_glossy, shade_specular
 from warp_dvct.plan import Plan
 from warp_dvct.scene import LightKind, Role, Scene
 
-MOST_KEPT_RAYS = 2**24  # 8 bytes each
+MOST_KEPT_RAYS = 2**24  # 8 bytes each, 16 where nothing but lights moves
 
 
 def render(
@@ -203,7 +204,13 @@ def _kept_rays(launcher: Launcher, scene: Scene, plan: Plan, kept: Kept | None) 
     while grids and sum(columns * rows * rays for columns, rows, rays in grids) > MOST_KEPT_RAYS:
         grids.pop()
     key = content_key(scene.camera, tuple(grids), settings.gather_stride, settings.seed)
-    return kept.get("gathered real hits", key, lambda: tuple(keep_rays(launcher, *grid) for grid in grids))
+    real = kept.get("gathered real hits", key, lambda: tuple(keep_rays(launcher, *grid) for grid in grids))
+    # Only where nothing moved since the last frame is there hope that nothing will before the next.
+    still = kept.last("all gathered hits", (key, kept.objects))
+    if still is None or (still == () and real):
+        still = () if still is None else tuple(keep_objects(launcher, rays) for rays in real)
+        kept.put("all gathered hits", (key, kept.objects), still)
+    return still or real
 
 
 def _irradiance(

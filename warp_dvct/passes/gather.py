@@ -151,7 +151,10 @@ class Gatherer:
 
 
 def keep_rays(launcher: Launcher, columns: int, rows: int, rays: int) -> Any:
-    """Empty ``KeptRays`` for ``rays`` of each block's point; with no blocks, the one that keeps nothing."""
+    """Empty ``KeptRays`` for ``rays`` of each block's point; with no blocks, the one that keeps nothing.
+
+    It keeps what rays meet in the real scene; :func:`keep_objects` adds what they meet on objects.
+    """
     kept = kernels.KeptRays()
     slots = columns * rows
     kept.slots, kept.columns = slots, columns
@@ -159,7 +162,21 @@ def keep_rays(launcher: Launcher, columns: int, rows: int, rays: int) -> Any:
     kept.count = launcher.zeros(max(1, slots * launcher.parts(slots)), wp.int32)
     kept.reach = launcher.empty(max(1, slots * rays), wp.float32)
     kept.triangle = launcher.empty(max(1, slots * rays), wp.int32)
+    kept.filled = launcher.zeros(1, wp.int32)
+    kept.object_reach, kept.object_triangle = launcher.empty(1, wp.float32), launcher.empty(1, wp.int32)
     return kept
+
+
+def keep_objects(launcher: Launcher, kept: Any) -> Any:
+    """``KeptRays`` that share what ``kept`` holds of the real scene, and keep what rays meet on objects that stay."""
+    whole = kernels.KeptRays()
+    for name in kernels.KeptRays.vars:
+        setattr(whole, name, getattr(kept, name))
+    whole.whole = kept.reach.shape[0] // max(1, kept.slots)
+    whole.filled = launcher.zeros(kept.point.shape[0], wp.int32)
+    whole.object_reach = launcher.empty(kept.reach.shape[0], wp.float32)
+    whole.object_triangle = launcher.empty(kept.reach.shape[0], wp.int32)
+    return whole
 
 
 def glossy_hits(launcher: Launcher, scene: Scene, device_scene: DeviceScene, bounces: Any, seed: int) -> Any:
