@@ -91,12 +91,8 @@ class KeptRays:
     columns: wp.int32  # blocks in a row of the picture
     point: wp.array(dtype=wp.int32)  # [slots * parts], -1 at first
     count: wp.array(dtype=wp.int32)  # [slots * parts], how many of its rays are kept
-    reach: wp.array(dtype=wp.float32)  # [slots * rays], hit distance
-    triangle: wp.array(dtype=wp.int32)  # [slots * rays], -1 where the ray meets nothing
-    whole: wp.int32  # rays of a slot, aimed ones as well, of which it is kept what they meet on objects; 0: of none
-    filled: wp.array(dtype=wp.int32)  # [slots * parts], 1 where those are kept
-    object_reach: wp.array(dtype=wp.float32)  # [slots * whole], hit distance on objects
-    object_triangle: wp.array(dtype=wp.int32)  # [slots * whole], -1 where the ray meets none
+    whole: wp.int32  # rays of a slot, aimed ones too, if what they meet on objects is kept; 0: even ones, real surfaces
+    hits: wp.array(dtype=wp.vec2i)  # [slots * rays], triangle or -1, bits of the distance; then the same of objects
 
 
 @wp.func
@@ -108,20 +104,27 @@ def kept_slot(kept: KeptRays, points: Points, j: int, stride: int) -> int:
 
 
 @wp.func
+def kept_hit(bits: wp.vec2i) -> Hit:
+    """What was kept of a hit."""
+    hit = Hit()
+    hit.triangle = bits[0]
+    hit.t = wp.cast(bits[1], wp.float32)
+    hit.found = wp.where(hit.triangle >= 0, 1, 0)
+    return hit
+
+
+@wp.func
 def kept_real(
     kept: KeptRays, keeps: bool, known: bool, at: int, geo: Geometry, origin: wp.vec3, direction: wp.vec3
 ) -> Hit:
     """The real surface along a ray: the kept one, or a traced one, which is kept if the ray is one of those."""
     hit = Hit()
     if known:
-        hit.t = kept.reach[at]
-        hit.triangle = kept.triangle[at]
-        hit.found = wp.where(hit.triangle >= 0, 1, 0)
+        hit = kept_hit(kept.hits[at])
     else:
         hit = trace_real(geo, origin, direction, FAR)
         if keeps:
-            kept.reach[at] = hit.t
-            kept.triangle[at] = hit.triangle
+            kept.hits[at] = wp.vec2i(hit.triangle, wp.cast(hit.t, wp.int32))
     return hit
 
 
@@ -144,16 +147,13 @@ def kept_synthetic(
     """The synthetic surface along a ray before the real one: as ``kept_real``."""
     hit = no_hit(ray.real.t)
     if known:
-        hit.t = kept.object_reach[at]
-        hit.triangle = kept.object_triangle[at]
-        hit.found = wp.where(hit.triangle >= 0, 1, 0)
+        hit = kept_hit(kept.hits[at])
         hit.synthetic = hit.found
     else:
         if not clear_of_objects(geo, body, s.normal_g, ray.origin, ray.direction, ray.real.t):
             hit = trace_synthetic(geo, ray.origin, ray.direction, ray.real.t)
         if keeps:
-            kept.object_reach[at] = hit.t
-            kept.object_triangle[at] = hit.triangle
+            kept.hits[at] = wp.vec2i(hit.triangle, wp.cast(hit.t, wp.int32))
     return hit
 
 
@@ -257,17 +257,14 @@ def gather_at(
     aim = aim_at(targets, s, few)
     if aim.rays > 0:
         even = few
-    known = False
-    filled = False
+    known = int(0)  # rays
     if kept_out.slots != 0:
         slot = part[0] * part[2] + part[1]
         # As many even rays as before are the same rays: their numbers start by how many there are. So are the aimed.
-        known = kept_out.point[slot] == j and kept_out.count[slot] == even
+        if kept_out.point[slot] == j and kept_out.count[slot] == even:
+            known = wp.max(even, kept_out.whole)
         kept_out.point[slot] = j
         kept_out.count[slot] = even
-        if kept_out.whole != 0:
-            filled = known and kept_out.filled[slot] != 0
-            kept_out.filled[slot] = 1
     start = first_sample(even * pixel_points(points, j, edge_samples), even, stride, points, j)
     count = even + aim.rays
     for k in range(count * part[1] / part[2], count * (part[1] + 1) / part[2]):
@@ -282,12 +279,12 @@ def gather_at(
         weight = ray_weight(aim, even, disk, drawn)
         ray = ray_over(s, disk, weight)
         if ray.up != 0:
-            whole = k < kept_out.whole
-            keeps = kept_out.slots != 0 and (k < even or whole)
             at = part[0] * rays + k
-            same = (known and k < even) or (filled and whole)
-            ray.real = kept_real(kept_out, keeps, same, at, geo, ray.origin, ray.direction)
-            ray.synthetic = kept_synthetic(kept_out, whole, filled and whole, at, geo, body, s, ray)
+            whole = k < kept_out.whole
+            keeps = whole or (kept_out.slots != 0 and k < even)
+            ray.real = kept_real(kept_out, keeps, k < known, at, geo, ray.origin, ray.direction)
+            at += kept_out.slots * rays
+            ray.synthetic = kept_synthetic(kept_out, whole, whole and k < known, at, geo, body, s, ray)
             light = hit_incident(world, ray.real, ray.synthetic, ray.origin, ray.direction, ray.solid_angle)
             light = focused_incident(light, hits, geo, world, ray, start + k)
             total = add_light(total, light, weight)
@@ -302,7 +299,7 @@ def of_turn(i: int, number: int, of: int) -> int:
     return (group * of + (number + group) % of) * RUN + i % RUN
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=128)  # two blocks of 256 threads a multiprocessor
 def _gather_rays(
     first: int,
     points: Points,

@@ -33,9 +33,9 @@ from warp_dvct.passes.gather import (
     focusing_materials,
     gather_all,
     glossy_hits,
-    keep_objects,
     keep_rays,
     rays_of,
+    real_alone,
     shade_indirect,
     strides,
 )
@@ -47,7 +47,8 @@ from warp_dvct.passes.specular import find_glossy, shade_specular
 from warp_dvct.plan import Plan
 from warp_dvct.scene import LightKind, Role, Scene
 
-MOST_KEPT_RAYS = 2**24  # 8 bytes each, 16 where nothing but lights moves
+MOST_KEPT_RAYS = 2**24  # 8 bytes each, 16 while nothing but lights moves
+REAL_HITS, ALL_HITS = "gathered real hits", "all gathered hits"
 
 
 def render(
@@ -193,7 +194,7 @@ def _shade_direct(
 
 
 def _kept_rays(launcher: Launcher, scene: Scene, plan: Plan, kept: Kept | None) -> tuple[Any, ...]:
-    """What the rays gathered at real surfaces met in the real scene, at each stride; nothing where that is not kept."""
+    """What the rays gathered at real surfaces met, at each stride; nothing where that is not kept."""
     settings = plan.settings
     if kept is None or settings.gather == "cones":
         return ()
@@ -204,13 +205,18 @@ def _kept_rays(launcher: Launcher, scene: Scene, plan: Plan, kept: Kept | None) 
     while grids and sum(columns * rows * rays for columns, rows, rays in grids) > MOST_KEPT_RAYS:
         grids.pop()
     key = content_key(scene.camera, tuple(grids), settings.gather_stride, settings.seed)
-    real = kept.get("gathered real hits", key, lambda: tuple(keep_rays(launcher, *grid) for grid in grids))
-    # Only where nothing moved since the last frame is there hope that nothing will before the next.
-    still = kept.last("all gathered hits", (key, kept.objects))
-    if still is None or (still == () and real):
-        still = () if still is None else tuple(keep_objects(launcher, rays) for rays in real)
-        kept.put("all gathered hits", (key, kept.objects), still)
-    return still or real
+    real = kept.get(REAL_HITS, key, lambda: tuple(keep_rays(launcher, *grid) for grid in grids))
+    # Objects that stayed since the last frame are likely to stay until the next: that frame makes room for them.
+    still = (key, kept.objects)
+    whole = kept.last(ALL_HITS, still)
+    if whole is None:
+        kept.put(ALL_HITS, still, ())
+        return real
+    if not whole:
+        whole = tuple(keep_rays(launcher, *grid, whole=True) for grid in grids)
+        kept.put(ALL_HITS, still, whole)
+        kept.put(REAL_HITS, key, tuple(real_alone(rays) for rays in whole))
+    return whole
 
 
 def _irradiance(

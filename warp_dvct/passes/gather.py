@@ -150,33 +150,29 @@ class Gatherer:
         return before, after
 
 
-def keep_rays(launcher: Launcher, columns: int, rows: int, rays: int) -> Any:
+def keep_rays(launcher: Launcher, columns: int, rows: int, rays: int, *, whole: bool = False) -> Any:
     """Empty ``KeptRays`` for ``rays`` of each block's point; with no blocks, the one that keeps nothing.
 
-    It keeps what rays meet in the real scene; :func:`keep_objects` adds what they meet on objects.
+    Args:
+        whole: Keep what rays meet on objects as well, which must stay, and not on real surfaces alone.
     """
     kept = kernels.KeptRays()
     slots = columns * rows
-    kept.slots, kept.columns = slots, columns
+    kept.slots, kept.columns, kept.whole = slots, columns, rays if whole else 0
     kept.point = launcher.full(max(1, slots * launcher.parts(slots)), -1, wp.int32)
     kept.count = launcher.zeros(max(1, slots * launcher.parts(slots)), wp.int32)
-    kept.reach = launcher.empty(max(1, slots * rays), wp.float32)
-    kept.triangle = launcher.empty(max(1, slots * rays), wp.int32)
-    kept.filled = launcher.zeros(1, wp.int32)
-    kept.object_reach, kept.object_triangle = launcher.empty(1, wp.float32), launcher.empty(1, wp.int32)
+    kept.hits = launcher.empty(max(1, slots * rays * (1 + whole)), wp.vec2i)
     return kept
 
 
-def keep_objects(launcher: Launcher, kept: Any) -> Any:
-    """``KeptRays`` that share what ``kept`` holds of the real scene, and keep what rays meet on objects that stay."""
-    whole = kernels.KeptRays()
+def real_alone(kept: Any) -> Any:
+    """What whole ``KeptRays`` keep of the real scene, on the same arrays, which are not whole any more once it is
+    written to."""
+    real = kernels.KeptRays()
     for name in kernels.KeptRays.vars:
-        setattr(whole, name, getattr(kept, name))
-    whole.whole = kept.reach.shape[0] // max(1, kept.slots)
-    whole.filled = launcher.zeros(kept.point.shape[0], wp.int32)
-    whole.object_reach = launcher.empty(kept.reach.shape[0], wp.float32)
-    whole.object_triangle = launcher.empty(kept.reach.shape[0], wp.int32)
-    return whole
+        setattr(real, name, getattr(kept, name))
+    real.whole = 0
+    return real
 
 
 def glossy_hits(launcher: Launcher, scene: Scene, device_scene: DeviceScene, bounces: Any, seed: int) -> Any:
