@@ -78,7 +78,7 @@ class DeviceScene:
         Args:
             origin: World position that becomes (0, 0, 0), shape ``[3]``, metres.
             scale: Volume-space units per metre, positive.
-            kept: Holds the real scene's part from frame to frame.
+            kept: Holds the real scene's part from frame to frame, and that of all triangles while none moves.
         Raises:
             ValueError: ``scale`` is not positive and finite.
             StageError: A triangle refers to a point or material that does not exist.
