@@ -127,7 +127,7 @@ def choose_trials(
                 continue
             for value in wanted.get(knob.name) or knob.values:
                 trial = Trial(method, knob.name, value, "balanced", {"bounces": str(bounces), **knob.settings(value)})
-                make_settings(trial.quality, trial.settings)  # a bad value is found before the work
+                make_settings(trial.quality, trial.settings, trial.method)  # a bad value is found before the work
                 trials.setdefault(_identity(trial), trial)
         if methods and len(trials) + len(left_out) == known:
             left_out.append(f"{method}: it has none of {', '.join(wanted)}")
@@ -154,7 +154,7 @@ def _of_method(method: str, wanted: Mapping[str, tuple[str, ...]], bounces: int)
             continue
         for value in values:
             trial = Trial(method, name, value, "balanced", {"bounces": str(bounces), name: value})
-            make_settings(trial.quality, trial.settings)
+            make_settings(trial.quality, trial.settings, trial.method)
             found.append(trial)
     return found
 
@@ -180,4 +180,4 @@ def _parse(chosen: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 def _identity(trial: Trial) -> tuple:
     """Points of a group that would render the same picture for the same cost are one."""
-    return trial.method, trial.group, make_settings(trial.quality, trial.settings)
+    return trial.method, trial.group, make_settings(trial.quality, trial.settings, trial.method)

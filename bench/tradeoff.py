@@ -142,7 +142,7 @@ class Bench:
         rows = []
         for trial in trials:
             trial = replace(trial, settings={**options.settings, **trial.settings})
-            settings = asdict(make_settings(trial.quality, trial.settings))
+            settings = asdict(make_settings(trial.quality, trial.settings, trial.method))
             row = self._point(self._key(trial.method, settings), trial, warm)
             # One picture may be a point of several sweeps.
             rows.append({**row, "group": trial.group, "value": trial.value, "name": trial.name})
@@ -181,7 +181,7 @@ class Bench:
         settings = {k: str(v) for k, v in trial.settings.items()}
         case = {"method": trial.method, "quality": trial.quality, "settings": settings}
         # Presets change from commit to commit: what they stood for here is part of the row.
-        case["resolved"] = asdict(make_settings(trial.quality, trial.settings))
+        case["resolved"] = asdict(make_settings(trial.quality, trial.settings, trial.method))
         return self._add(key, {**case, "group": trial.group, "value": trial.value, "name": trial.name}, figures, comp)
 
     def _add(self, key: str, case: dict[str, Any], figures: dict[str, Any], comp: np.ndarray) -> dict[str, Any]:

@@ -172,7 +172,7 @@ class _Chooser:
         self.method, self.survey, self.model, self.accuracy = method, survey, model, accuracy
         self.slowness = slowness
         self.width, self.height, self.threads, self.fixed = width, height, threads, fixed
-        self.base = make_settings("balanced", fixed)
+        self.base = make_settings("balanced", fixed, method)
         self.required = math.ceil(VOXELS_PER_FEATURE / survey.feature) if survey.feature > 0.0 else 0
         self.ladders = [
             self._required(x)
@@ -258,7 +258,7 @@ class _Chooser:
         its time early on may not be in the end. Values that no ladder has are rounded to the cheaper side."""
         fit = []
         for quality in QUALITIES:
-            wanted = make_settings(quality, self.fixed)
+            wanted = make_settings(quality, self.fixed, self.method)
             state = {}
             for ladder in self.ladders:
                 value = float(getattr(wanted, NAMES[ladder.knob]))

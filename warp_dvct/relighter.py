@@ -87,7 +87,7 @@ class Relighter:
     ) -> None:
         if method not in METHODS:
             raise OptionError(f"method is '{method}'; choose one of {', '.join(METHODS)}")
-        self.settings = make_settings(quality, settings)
+        self.settings = make_settings(quality, settings, method)
         self._given = dict(settings or {})
         self._overlap = overlap
         self.method = method

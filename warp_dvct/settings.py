@@ -27,7 +27,7 @@ class Settings:
     """All knobs, at their ``balanced`` values unless said otherwise; :func:`make_settings` applies presets."""
 
     seed: int = _knob(0, "seed of every random number", low=0, high=2**31 - 1)
-    bounces: int = _knob(6, "indirect bounces: 0 direct light only, 1 the paper's single bounce", low=0, high=64)
+    bounces: int = _knob(12, "indirect bounces: 0 direct light only, 1 the paper's single bounce", low=0, high=64)
     antialias: int = _knob(8, "shading points per edge pixel; 0 for none", low=0, high=64)
 
     # Rays see no difference between these and the paper's 256: what shows is how many texels light a voxel.
@@ -141,7 +141,6 @@ class Settings:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
-        "bounces": 4,
         "volume.resolution": 32,
         "volume.coarse": 32,
         "rsm.texels": 240,
@@ -160,7 +159,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "balanced": {},
     "high": {
-        "bounces": 12,
         "rsm.density": 3,
         "shadows.samples": 32,
         "shadows.probes": 16,
@@ -177,14 +175,21 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
+# Over the presets: there each bounce takes shadow maps of its own, where links between patches cost nothing.
+PRESETS_OF: dict[str, dict[str, dict[str, Any]]] = {
+    "instant-radiosity": {"draft": {"bounces": 4}, "balanced": {"bounces": 6}},
+}
+
 _FIELDS = {f.name: f for f in fields(Settings)}
 # A dot stands only where the first word names a group, so that ``gather_object_rays`` is ``gather.object_rays``.
 UNGROUPED = {"shadow_maps"}
 NAMES = {f if f in UNGROUPED else f.replace("_", ".", 1): f for f in _FIELDS}
 
 
-def make_settings(quality: str = "balanced", overrides: Mapping[str, Any] | None = None) -> Settings:
-    """Settings of a preset with single knobs changed.
+def make_settings(
+    quality: str = "balanced", overrides: Mapping[str, Any] | None = None, method: str = "delta-cones"
+) -> Settings:
+    """Settings of a method's preset with single knobs changed.
 
     Args:
         quality: ``draft``, ``balanced`` or ``high``.
@@ -195,7 +200,8 @@ def make_settings(quality: str = "balanced", overrides: Mapping[str, Any] | None
     if quality not in QUALITIES:
         raise OptionError(f"quality is '{quality}'; choose one of {', '.join(QUALITIES)}")
     values: dict[str, Any] = {}
-    for name, value in {**PRESETS[quality], **dict(overrides or {})}.items():
+    of_method = PRESETS_OF.get(method, {}).get(quality, {})
+    for name, value in {**PRESETS[quality], **of_method, **dict(overrides or {})}.items():
         if name not in NAMES:
             near = difflib.get_close_matches(name, NAMES, 1, 0.4)
             hint = f"; did you mean '{near[0]}'?" if near else ""
