@@ -92,13 +92,13 @@ def test_further_bounces_leak_no_more_than_the_first(direct, dense, most):
 
 
 def furnished(low, high, **settings):
-    """Eight bounces by rays at every pixel, with a box of real furniture between two corners."""
+    """Six bounces by rays at every pixel, with a box of real furniture between two corners."""
     scene = read_stage(usd_scenes.path("thin_wall"))
     low, high = np.array(low), np.array(high)
     box = lit.cuboid((0.0, 0.0, 0.0), 1.0) * (0.5 * (high - low)) + 0.5 * (low + high)
     furniture = lit.mesh(box, Role.REAL, scene.meshes[0].materials[0])
     scene = replace(scene, meshes=(scene.meshes[0], furniture, *scene.meshes[1:]))
-    settings = {"gather.stride": "1", "gather.object_stride": "1", "bounces": "8", **settings}
+    settings = {"gather.stride": "1", "gather.object_stride": "1", "bounces": "6", **settings}
     return Relighter(scene, settings=settings, width=WIDTH, threads=2).render()
 
 
@@ -109,8 +109,9 @@ def furnished(low, high, **settings):
 )
 def test_furniture_beside_the_wall_keeps_its_light(low, high):
     """Its back looks the way the wall's far side does, from the same voxels, and used to be taken for it: .9 % of the
-    lit room's indirect light spread in the dark room (shelf; .7 % the board). Now .33 and .44 %; .13 % without it."""
-    assert max(leak(furnished(low, high), furnished(low, high, bounces="0"))) < 5e-3
+    lit room's indirect light spread in the dark room (shelf; .7 % the board). Now .30 and .38 %; with twelve bounces,
+    as what leaks goes on to bounce, .36 and .51 %."""
+    assert max(leak(furnished(low, high), furnished(low, high, bounces="0"))) < 4e-3
 
 
 def test_furniture_in_the_dark_room_stays_dark():
