@@ -7,6 +7,7 @@ from dataclasses import fields
 
 import pytest
 
+from warp_dvct import Relighter, usd_scenes
 from warp_dvct.errors import OptionError
 from warp_dvct.settings import NAMES, PRESETS, QUALITIES, Settings, describe_settings, make_settings
 
@@ -15,6 +16,14 @@ def test_defaults_are_balanced():
     assert make_settings() == make_settings("balanced")
     assert {f.name for f in fields(Settings)} == set(NAMES.values())
     assert set(PRESETS) == set(QUALITIES)
+
+
+def test_bounces_go_by_the_method_where_each_takes_maps_of_its_own():
+    """Links between patches make further bounces free; further VPLs need shadow maps."""
+    assert {make_settings(q).bounces for q in QUALITIES} == {12}
+    assert [make_settings(q, method="instant-radiosity").bounces for q in QUALITIES] == [4, 6, 12]
+    assert make_settings("draft", {"bounces": 1}, "instant-radiosity").bounces == 1
+    assert Relighter(usd_scenes.path("room_area"), method="instant-radiosity", width=16).settings.bounces == 6
 
 
 def test_presets_differ_and_every_default_is_in_its_own_range():

@@ -24,6 +24,7 @@ from warp_dvct.launch import Launcher
 from warp_dvct.passes.hull import Hulls, new_hulls, real_hull
 from warp_dvct.passes.sidedness import lit_from_behind
 from warp_dvct.scene import Camera, Light, LightKind, Material, Mesh, Role, Scene, Texture
+from warp_dvct.structs import with_fields
 from warp_dvct.targets import targets_of
 
 # A closed mesh may be met from behind by the odd ray that slips through an edge; this many are no accident.
@@ -99,7 +100,7 @@ class DeviceScene:
             kept.put(TRIANGLES, kept.objects, triangles)
         host, real = triangles.host, triangles.real
         triangles.hulls.look_from(launcher, camera.origin)
-        geometry = triangles.geometry()
+        geometry = with_fields(Geometry, triangles.surfaces)
         blocking = triangles.hull.blocking(triangles.boxes, scene.lights, origin, scale)
         blockers, box = kept.get("blockers", blocking.tobytes(), lambda: _blockers(launcher, host, real, blocking))
         _set_blockers(geometry, blockers, box)
@@ -198,7 +199,7 @@ class _Triangles:
 
     Attributes:
         boxes: Of the synthetic meshes, ``[m, 2, 3]``.
-        surfaces: ``Geometry`` without what lights decide of it: blockers and sides.
+        surfaces: ``Geometry`` without what lights decide of it, blockers and sides: a copy of it is completed.
     """
 
     host: _HostTriangles
@@ -208,13 +209,6 @@ class _Triangles:
     synthetic: Any
     hulls: Hulls
     surfaces: Any
-
-    def geometry(self) -> Any:
-        """A copy of ``surfaces``, on the same arrays, to be completed."""
-        geometry = Geometry()
-        for name in Geometry.vars:
-            setattr(geometry, name, getattr(self.surfaces, name))
-        return geometry
 
 
 def _begin_triangles(

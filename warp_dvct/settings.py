@@ -27,7 +27,12 @@ class Settings:
     """All knobs, at their ``balanced`` values unless said otherwise; :func:`make_settings` applies presets."""
 
     seed: int = _knob(0, "seed of every random number", low=0, high=2**31 - 1)
-    bounces: int = _knob(12, "indirect bounces: 0 direct light only, 1 the paper's single bounce", low=0, high=64)
+    bounces: int = _knob(
+        12,
+        "indirect bounces: 0 direct light only, 1 the paper's single bounce (instant-radiosity: 4 draft, 6 balanced)",
+        low=0,
+        high=64,
+    )
     antialias: int = _knob(8, "shading points per edge pixel; 0 for none", low=0, high=64)
 
     # Rays see no difference between these and the paper's 256: what shows is how many texels light a voxel.

@@ -17,6 +17,7 @@ from warp_dvct.kernels.glossy_hits import FOCUSING, GlossyHits
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.gbuffer import GBuffer, compact
 from warp_dvct.scene import Material, Role, Scene
+from warp_dvct.structs import with_fields
 
 PLANE_TOLERANCE = 0.5  # distance off the tangent plane, in gather strides, at which a gathered point counts 1/e
 FINEST = 2  # pixels to which details halve the stride
@@ -168,11 +169,7 @@ def keep_rays(launcher: Launcher, columns: int, rows: int, rays: int, *, whole: 
 def real_alone(kept: Any) -> Any:
     """What whole ``KeptRays`` keep of the real scene, on the same arrays, which are not whole any more once it is
     written to."""
-    real = kernels.KeptRays()
-    for name in kernels.KeptRays.vars:
-        setattr(real, name, getattr(kept, name))
-    real.whole = 0
-    return real
+    return with_fields(kernels.KeptRays, kept, whole=0)
 
 
 def glossy_hits(launcher: Launcher, scene: Scene, device_scene: DeviceScene, bounces: Any, seed: int) -> Any:

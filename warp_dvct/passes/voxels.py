@@ -13,6 +13,7 @@ from warp_dvct.kernels import voxelization as kernels
 from warp_dvct.kernels.volume import Volume
 from warp_dvct.launch import Launcher
 from warp_dvct.passes.sorting import count_below, scan, sort_by_key, unique_runs
+from warp_dvct.structs import with_fields
 
 
 @dataclass(frozen=True)
@@ -240,8 +241,5 @@ def _build_maps(launcher: Launcher, level_keys: list[Any], box: Box) -> Any:
 
 def unlit(launcher: Launcher, voxels: Voxels) -> Voxels:
     """The same voxels with a zero field of their own, to be lit."""
-    volume = Volume()
-    for name in Volume.vars:
-        setattr(volume, name, getattr(voxels.volume, name))
-    volume.field = launcher.zeros(12 * volume.records, wp.vec4)
-    return replace(voxels, volume=volume)
+    field = launcher.zeros(12 * voxels.volume.records, wp.vec4)
+    return replace(voxels, volume=with_fields(Volume, voxels.volume, field=field))
